@@ -16,6 +16,7 @@ COMMANDS = {
     "excite": ("excite.excite", "Design the motion from which fit-dynamics learns most about any arm."),
     "fit-dynamics": ("fit_dynamics.fit_dynamics", "Fit the inertia of any arm from its URDF and a log."),
     "compensate": ("compensate.compensate_robot", "Compensate gravity, so that the robot is led by hand."),
+    "follow": ("follow.follow", "Follow a motion with the identified model; compare input modes."),
 }
 
 app = lazy_app(

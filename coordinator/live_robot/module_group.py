@@ -319,6 +319,8 @@ class ModuleGroup:
         self, serial: str, position_rad: float | None, velocity_rad_s: float | None, effort_nm: float | None
     ) -> None:
         """Send one set-point, which is not acknowledged; None switches a loop off."""
+        # The set-point replaces the last motion, which must not be commanded again.
+        self._running.pop(serial, None)
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
         self._messenger.publish(serial, Leaf.SETPOINT, self._command(Setpoint, serial, **point))
 

@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coordinator.live_robot.errors import ModuleLost, RobotStopped
 from coordinator.live_robot.messenger import Clock, Messenger, Post, gather_all
 from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
 from coordinator.recording.recording import Recording
@@ -24,10 +23,11 @@ from coordinator.torque_control.gravity_compensation import (
 )
 from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.preconditions import check_gravity, find_robot
+from coordinator.torque_control.streamed_states import StreamedStates
 from coordinator.torque_control.summary import CompensationSummary, CompensationTally
 from module_agent.model.chain import Array
 from module_agent.transport.transport import Transport
-from module_agent.wire.feedback_rows import STATE_NAMES, Rows
+from module_agent.wire.feedback_rows import Rows
 
 # The oldest feedback to act on, as a share of the command lifetime: modules refuse commands that echo older
 # feedback.
@@ -36,7 +36,6 @@ STALE_SHARE = 0.8
 _REST_ROWS = 25
 # Retained rows; older ones are dropped at this interval.
 _RETAINED_ROWS, _FORGET_EVERY_S = 250, 2.0
-_RELEASED_STATES = ("idle", "expired", "stopped", "fault")
 
 
 class CompensationPlan(NamedTuple):
@@ -99,7 +98,7 @@ class CompensationSession:
         self._asked = ""
         # The number of calls of `end`, and that number when the robot was held.
         self._end_requests = self._end_requests_seen = 0
-        self._held_all = False
+        self._states = StreamedStates(self._group)
         self._is_under_torque = False
         self._streaming: asyncio.Task[None] | None = None
 
@@ -211,7 +210,7 @@ class CompensationSession:
         renewed_s = due_s - KEEP_ALIVE_S
         while True:
             now_s = self._now_s()
-            self._check_states()
+            self._states.check()
             self._step(compensator, now_s)
             if now_s - renewed_s >= KEEP_ALIVE_S:
                 self._group.renew()
@@ -240,22 +239,6 @@ class CompensationSession:
         self._screen.moment(
             Moment(compensator.phase, tally.compensated_s, tally.missed, reading, targets.effort_nm)
         )
-
-    def _check_states(self) -> None:
-        """Check that every module executes set-points, once all have begun to.
-
-        Raises:
-            RobotStopped, ModuleLost: one does not any more.
-        """
-        states = {s: STATE_NAMES[int(self._newest(s)["state"][0])] for s in self._serials}
-        self._held_all = self._held_all or set(states.values()) == {"streaming"}
-        for serial, state in states.items():
-            if self._held_all and state in _RELEASED_STATES:
-                status = self._group.module(serial).status
-                note = status.note if status is not None and status.state == state else ""
-                if state == "stopped":
-                    raise RobotStopped(serial, note or "stopped")
-                raise ModuleLost(serial, f"its motor is off, {state}" + (f": {note}" if note else ""))
 
     # ------------------------------------------------------------------ the end
 
