@@ -57,7 +57,7 @@ body {{ font: .94rem/1.5 system-ui, "DejaVu Sans", sans-serif; color: var(--ink)
 h1 {{ font-size: 1.7rem; line-height: 1.2; margin: 0 0 .3rem; }}
 h2 {{ font-size: 1.2rem; margin: 2.2rem 0 .6rem; break-after: avoid;
   padding-bottom: .2rem; border-bottom: 1px solid var(--grid); }}
-p {{ margin: .5rem 0; }} h2 + p {{ break-after: avoid; }}
+p {{ margin: .5rem 0; break-inside: avoid; }} h2 + p {{ break-after: avoid; }}
 .subtitle {{ color: var(--muted); margin: 0 0 1rem; }}
 a {{ color: var(--measured); }}
 nav {{ font-size: .9rem; }} nav a {{ margin-right: 1rem; white-space: nowrap; }}
