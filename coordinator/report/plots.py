@@ -402,7 +402,7 @@ def _curve(axes: "Axes", curve: Curve, number: int) -> None:
     """Draw a curve with the look of its number in the legend."""
     look: dict[str, Any] = {"color": _COLOURS[_CURVE_COLOURS[number % len(_CURVE_COLOURS)]]}
     if curve.style == "level":
-        look |= {"linewidth": 1.2, "linestyle": "--" if number % 2 else ":"}
+        look |= {"linewidth": 1.4, "linestyle": "--" if number % 2 else "-."}
     else:
         marked = curve.style == "points" or len(curve.x) < _FEW_POINTS
         mark, size = _MARKS[number % len(_MARKS)]
