@@ -205,7 +205,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         signs = encoder_signs(topology, search.observations, rest.specific_force_m_s2)
         check_encoder_signs(signs)
         geared = gear_trains(recording, topology.serials)
-        check_opposed([one for one in geared if one.measured < 0.0], signs)
+        check_opposed(geared.opposed, signs)
         types = [recording.module_type(s) for s in topology.serials]
         explored = _exploration(recording, clocks, topology.serials)
         first = assemble(
@@ -218,20 +218,23 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         motions, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
-        other_type = [topology.serials.index(one.serial) for one in geared if one.measured > 0.0]
+        other_type, scaled = (
+            [topology.serials.index(s) for s in some] for some in (geared.other_type, geared.scaled)
+        )
         known = measured_before(topology.serials, prior, measured).widened(other_type, ANYWHERE_M)
         rest_window = _rest(recording, clocks, topology.serials)
         imu_rate_hz = min(_imu_rate_hz(recording, serial) for serial in topology.serials)
         noise = motion_noise(windows, rest_window, REFINEMENT_CUTOFF_HZ, imu_rate_hz)
-        refined, suspects = refine_checked(first.chain, types, windows, prior, floor, known, noise)
+        refined, suspects = refine_checked(first.chain, types, windows, prior, floor, known, noise, scaled)
         refined = _settled(refined, first.chain)
         motion = joined_motions([filtered_window(one) for one in windows])
         opposed = effort_signs(refined.chain, types, motion)
         check_opposed(opposed, signs)
+        doubted = doubted_sensors(refined, prior, suspects.imus, suspects.encoders)
         findings = (
             *opposed,
-            *geared,
-            *doubted_sensors(refined, prior, suspects.imus, suspects.encoders),
+            *(one for one in geared.findings if one.serial not in {other.serial for other in doubted}),
+            *doubted,
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
         )
     except (DataError, np.linalg.LinAlgError) as error:

@@ -69,16 +69,18 @@ def refine_checked(
     floor: NoiseFloor | None = None,
     calibration: ImuCalibration | None = None,
     noise: Array | None = None,
+    doubted: Sequence[int] = (),
 ) -> tuple[Refinement, Suspects]:
     """Refine as `refine_robot`; what contradicts the catalogue is free, so that the claim covers it.
 
-    If errors of IMUs or scales of encoders are outliers, the chain is refined with all IMUs anywhere and all
-    scales free. Those that are significant then stay free in the fit that is returned.
+    The scales of `doubted` encoders are free in any case. If errors of IMUs or scales of encoders are
+    outliers, the chain is refined with all IMUs anywhere and all scales free. Those that are significant then
+    stay free in the fit that is returned.
     """
     known = calibration if calibration is not None else catalogued(chain.serials, prior)
-    refined = refine_robot(chain, kinds, windows, prior, floor, known, noise=noise)
     count = len(chain.serials)
-    suspects = Suspects((), (), np.zeros(count))
+    suspects = Suspects((), tuple(doubted), np.zeros(count))
+    refined = refine_robot(chain, kinds, windows, prior, floor, known, suspects, noise)
     if count == 1 or _outlier(refined, prior, known) < SUSPICIOUS:
         return refined, suspects
     everyone = tuple(range(count))
@@ -87,6 +89,7 @@ def refine_checked(
     moved = free.placement - known.placement
     away = np.abs(moved / np.hypot(free.placement_sigma, known.placement_sigma))[:, 3:].max(axis=1)
     off = _scale_sigmas(free) > SIGNIFICANT
+    off[list(doubted)] = True
     imus, encoders = (tuple(np.flatnonzero(some).tolist()) for some in (away > SIGNIFICANT, off))
     if not imus and not encoders:
         return refined, suspects

@@ -9,6 +9,7 @@ import pytest
 
 from coordinator.identification.identified import IdentificationError, Kinematics
 from coordinator.identification.identify import identify_kinematics
+from coordinator.identification.robot_refinement import refine_checked
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.session_file import read_session
 from module_agent.wire.codec import decode, encode
@@ -129,6 +130,39 @@ def test_an_encoder_with_a_wrong_scale_is_named_and_its_scale_estimated(run: lis
     _covered(kinematics)
 
 
+def test_a_leafs_encoder_with_a_wrong_scale_is_named_by_its_motor(run: list[Entry]) -> None:
+    kinematics = identify_kinematics(_altered(run, _scaled(ELBOW, 1.01)))
+    (finding,) = kinematics.findings
+    assert (finding.serial, finding.measured) == (ELBOW, pytest.approx(762.2 / 1.01, rel=2e-3))
+    _covered(kinematics)
+
+
+def test_a_vertical_joints_scale_is_free_where_gyros_do_not_tell_it(
+    run: list[Entry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Gravity does not turn about the axis, and the scales of gyros as delivered are good to a percent.
+    delivered = [
+        entry._replace(payload=entry.payload.replace(b'"calibrated"', b'"uncalibrated"'))
+        if entry.kind == "journal"
+        else entry
+        for entry in run
+    ]
+    free: list[tuple[int, ...]] = []
+
+    def checked(*of_robot: Any) -> Any:
+        refined, suspects = refine_checked(*of_robot)
+        free.append(suspects.encoders)
+        return refined, suspects
+
+    monkeypatch.setattr("coordinator.identification.identify.refine_checked", checked)
+    kinematics = identify_kinematics(_altered(delivered, _scaled(YAW, 1.01)))
+    assert [finding.serial for finding in kinematics.findings] == [YAW]
+    yaw = kinematics.topology.serials.index(YAW)
+    assert free[-1] == (yaw,)
+    assert kinematics.refinement.encoder_scale[yaw] == pytest.approx(-0.01, abs=5e-3)
+    _covered(kinematics)
+
+
 def _relabelled(run: list[Entry], serial: str, label: str) -> list[Entry]:
     entries = []
     for entry in run:
@@ -155,7 +189,7 @@ def test_a_leaf_that_reports_another_type_is_named_by_its_gear_train(run: list[E
     # Where its IMU sits in the housing shows in no motion: the claim holds 50 mm for it.
     kinematics = identify_kinematics(_altered(_relabelled(run, ELBOW, "X5-9-old"), lambda *_: None))
     (finding,) = kinematics.findings
-    assert (finding.serial, finding.measured) == (ELBOW, pytest.approx(762.0, rel=0.1))
+    assert (finding.serial, finding.measured) == (ELBOW, pytest.approx(762.0, rel=0.01))
     length_sigma_m = kinematics.fit.link_length_sigma_m[kinematics.topology.serials.index(ELBOW)]
     assert length_sigma_m > 0.04
 
