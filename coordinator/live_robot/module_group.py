@@ -369,7 +369,7 @@ class ModuleGroup:
             status = self.module(serial).status if ended else await self.ask_status(serial)
             motion = status.motion if status is not None else None
             if motion is None or motion.motion_id != started[serial].number or motion.outcome != "done":
-                raise MotionInterrupted(serial, motion.outcome if motion is not None else "lost")
+                raise MotionInterrupted(serial, _unfinished(motion))
             records[serial] = motion
         return records
 
@@ -461,3 +461,11 @@ class ModuleGroup:
             if await self.wait(lambda: received() is not None, 0.3):
                 break
         return received()
+
+
+def _unfinished(motion: MotionRecord | None) -> str:
+    if motion is None:
+        return "lost"
+    if motion.outcome == "running":
+        return "still running 3 s after its end: the module, or a simulated world, is slower than real time"
+    return motion.outcome

@@ -43,6 +43,8 @@ _AT_START_RAD = 0.02
 # The measured torque fades into the calculated one within the first half of settling.
 SETTLE_S, _FADE = 1.5, 0.5
 REST_S = 0.3
+# From the end of a way to where the joints are at rest.
+_STILL_S = 0.5
 _RETAINED_ROWS = 250
 
 
@@ -186,12 +188,14 @@ class FollowSession:
         While settling, the measured torque fades into that of the start.
         """
         gains = [self._group.info(serial).gains for serial in self._serials]
-        measured_nm, winding_c = self._means("effort_nm", "winding_temperature_c")
+        q_rad, measured_nm, winding_c = self._means("position_rad", "effort_nm", "winding_temperature_c")
+        # At rest the spring exerts the weight, whatever friction holds: what differs is the sensors' offset.
+        offset_nm = measured_nm - self._model.effort_nm(q_rad, np.zeros_like(q_rad))
         phases = []
         # Each by itself: a motion may begin with an acceleration, which no motor compensates at once.
         for phase in (standing(reference, 0, SETTLE_S), reference, standing(reference, -1, REST_S)):
             torque = calculated_nm(self._model, phase, gains, winding_c.tolist(), self._plan.drive)
-            phases.append(_SetPoints(phase.q_rad, phase.qd_rad_s, torque))
+            phases.append(_SetPoints(phase.q_rad, phase.qd_rad_s, torque + offset_nm))
         settling = phases[0].effort_nm
         share = np.minimum(np.arange(len(settling)) / (_FADE * len(settling)), 1.0)[:, None]
         phases[0] = phases[0]._replace(effort_nm=measured_nm + share * (settling - measured_nm))
@@ -203,6 +207,7 @@ class FollowSession:
             for serial, q in zip(self._serials, target_rad, strict=True)
         }
         await self._group.run(goals)
+        await asyncio.sleep(_STILL_S)
 
     async def _stream(self, points: _SetPoints, mode: InputMode) -> None:
         """Stream set-points at the plan's rate to their end; no feedback of that time is missing then."""
