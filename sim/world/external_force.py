@@ -41,13 +41,18 @@ class Push(Strict):
             raise ValueError("nothing pushes: give force_n, torque_nm or both")
         return self
 
+    @property
+    def lasts_ns(self) -> tuple[int, int]:
+        """World time from which on the wrench acts, and at which it has ended [ns]."""
+        return round(self.from_s * 1e9), round((self.from_s + self.for_s) * 1e9)
+
     def acts(self, t_ns: int) -> bool:
         """Return whether the wrench acts at a world time [ns]."""
-        return round(self.from_s * 1e9) <= t_ns and not self.is_over(t_ns)
+        return self.lasts_ns[0] <= t_ns and not self.is_over(t_ns)
 
     def is_over(self, t_ns: int) -> bool:
         """Return whether the wrench has ended at a world time [ns]."""
-        return t_ns >= round((self.from_s + self.for_s) * 1e9)
+        return t_ns >= self.lasts_ns[1]
 
 
 def parse_push(text: str) -> Push:

@@ -110,6 +110,8 @@ class World:
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
         self._pushes: list[Push] = []
+        self._acting: list[Push] = []
+        self._pushes_change_ns = 0
         for one in pushes:
             self.push(one)
         self._actuators.reset(robot.start_rad, load)
@@ -160,6 +162,7 @@ class World:
         """
         check_pushed(push, self.robot.serials)
         self._pushes.append(push)
+        self._pushes_change_ns = self.t_ns
 
     def become(self, robot: Robot) -> None:
         """Go on as a robot with the same modules and joints but other links or payloads, moving as before.
@@ -240,16 +243,23 @@ class World:
             raise HardwareLost("the world is closed")
         if len(pwm) != len(self.modules):
             raise ValueError(f"{len(pwm)} PWM values for {len(self.modules)} modules")
-        for module, value in zip(self.modules, pwm, strict=True):
-            if not math.isfinite(value):
-                raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
-        return np.array([min(max(value, -1.0), 1.0) for value in pwm], dtype=np.float64)
+        if not all(map(math.isfinite, pwm)):
+            wrong = next(k for k, value in enumerate(pwm) if not math.isfinite(value))
+            serial = self.modules[wrong].serial
+            raise ValueError(f"PWM of module {serial} is {pwm[wrong]}; it must be a number in [-1, 1]")
+        # Most are within the limits, which is cheaper to see than to enforce.
+        within = min(pwm) >= -1.0 and max(pwm) <= 1.0
+        return np.array(pwm if within else [min(max(value, -1.0), 1.0) for value in pwm], dtype=np.float64)
 
     def _pushed(self, q: Array) -> Array:
         """Return the generalised forces (m,) of the pushes at this instant; drop those that have ended."""
-        self._pushes = [push for push in self._pushes if not push.is_over(self.t_ns)]
+        if self.t_ns >= self._pushes_change_ns:
+            self._pushes = [push for push in self._pushes if not push.is_over(self.t_ns)]
+            self._acting = [push for push in self._pushes if push.acts(self.t_ns)]
+            edges_ns = [edge_ns for push in self._pushes for edge_ns in push.lasts_ns]
+            self._pushes_change_ns = min((ns for ns in edges_ns if ns > self.t_ns), default=self.t_ns)
         load = np.zeros_like(q)
-        for push in (one for one in self._pushes if one.acts(self.t_ns)):
+        for push in self._acting:
             body = int(self._joints[self.robot.serials.index(push.serial)])
             wrench = np.array(push.at_m), np.array(push.force_n), np.array(push.torque_nm)
             load += self._tree.joint_loads(q, body, *wrench)

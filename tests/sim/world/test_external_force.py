@@ -103,6 +103,21 @@ def test_a_push_may_come_while_the_world_runs_and_moves_a_body_along_the_force()
     assert _height(chain, world.plant.q_rad) > before + 0.01
 
 
+def test_pushes_begin_and_end_each_at_its_own_time_whenever_they_were_given() -> None:
+    first, second, third = (
+        Push(serial=TIP, force_n=(0.0, 5.0, 0.0), at_m=(0.1, 0.0, 0.0), from_s=from_s, for_s=0.02)
+        for from_s in (0.01, 0.02, 0.05)
+    )
+    at_once = _motion(World(load_robot(ARM), 1, pushes=(first, second, third)), 80)
+    world = World(load_robot(ARM), 1, pushes=(first, third))
+    before = _motion(world, 15)
+    world.push(second)
+    np.testing.assert_array_equal(np.concatenate([before, _motion(world, 65)]), at_once)
+    two = _motion(World(load_robot(ARM), 1, pushes=(first, second)), 80)
+    np.testing.assert_array_equal(two[:50], at_once[:50])
+    assert not np.array_equal(two[50], at_once[50])
+
+
 def _height(chain: Chain, q_rad: Array) -> float:
     """How high the last joint is along gravity [m]."""
     tip = body_displacements(chain, q_rad[None])[0, -1] @ [*chain.point[-1], 1.0]
