@@ -6,7 +6,7 @@ from scipy.linalg import block_diag
 
 from coordinator.dynamics.pseudo_inertia import parameter_transform
 from coordinator.excitation.plan import Plan
-from coordinator.identification.identified import Identified
+from coordinator.identification.identified import Identified, Kinematics
 from coordinator.identification.identify import identify
 from coordinator.parameter_fit.base_parameters import joint_frames
 from coordinator.recording.recording import Recording
@@ -32,13 +32,22 @@ PLAN = Plan(excitation="d-optimal", excitation_motions=MOTIONS, excitation_s=4.0
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
-    return record_session(VirtualSettings(load_robot(ARM), network("lan"), SEED, NOISE), PLAN)
+def found_in() -> tuple[Recording, Identified]:
+    """A recorded session, and what is identified with the chain that its motions were designed for."""
+    explored: list[Kinematics] = []
+    settings = VirtualSettings(load_robot(ARM), network("lan"), SEED, NOISE)
+    recording = record_session(settings, PLAN, on_explored=explored.append)
+    return recording, identify(recording, explored=explored[0])
 
 
 @pytest.fixture(scope="module")
-def found(recording: Recording) -> Identified:
-    return identify(recording)
+def recording(found_in: tuple[Recording, Identified]) -> Recording:
+    return found_in[0]
+
+
+@pytest.fixture(scope="module")
+def found(found_in: tuple[Recording, Identified]) -> Identified:
+    return found_in[1]
 
 
 def base_parameter_count(chain: Chain) -> int:

@@ -13,18 +13,17 @@ from coordinator.baseline.payload import PayloadError, payload_plan, search_payl
 from coordinator.commands.measured_again import PAYLOAD
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
-from coordinator.identification.identify import identify_kinematics
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.chain import Array, Chain
 from module_agent.network_emulation.profile_file import network
+from sim.benchmark.cases.link_change import known_robot
 from sim.geometry.link_parts import FreePose
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import loaded
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.run import VirtualConfig, run_virtual
-from sim.virtual_time.session import record_session
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("payload")
@@ -50,9 +49,7 @@ def lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
 
 def remembered(robot: Robot, day: int, plan: Plan) -> BaselineRobot:
     """The same without a folder."""
-    settings = VirtualSettings(robot, network("lan"), 6, "x5", noise_seed=day)
-    recording = record_session(settings, plan)
-    return BaselineRobot(Path("in memory"), recording, identify_kinematics(recording))
+    return known_robot(VirtualSettings(robot, network("lan"), 6, "x5", noise_seed=day), plan, day)
 
 
 @pytest.fixture(scope="module")
