@@ -13,9 +13,6 @@ COMMANDS = {
     "score": ("score.score_run", "Compare a run's result with the simulator's truth."),
     "benchmark": ("benchmark.app", "Measure the whole system against its bars."),
     "thesis": ("thesis.thesis", "Repeat the thesis' experiments and compare with what it printed."),
-    "amplitudes": ("amplitudes.amplitudes", "Repeat the thesis' estimates of link length over amplitudes."),
-    "estimators": ("estimators.estimators", "Compare estimators of a joint's radial distance."),
-    "assistance": ("assistance.assistance", "Measure tracking errors with and without feed-forward torque."),
     "monitoring": ("monitoring.monitoring", "Count what the monitor finds, and its false alarms."),
     "compare-log": ("compare_log.compare_log", "Compare a real module's log with the simulated module."),
 }

@@ -43,7 +43,6 @@ SHORTER = {
     "x5-coordinator excite": ("--tries", "30"),
     "x5-sim benchmark kinematics": ("--trials", "1"),
     "x5-sim benchmark dynamics": ("--only", "regressor"),
-    "x5-sim amplitudes": ("--amplitudes", "0.1"),
 }
 SHORTER_PLAN = """
 discover_s = 0.5

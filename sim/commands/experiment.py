@@ -41,11 +41,6 @@ class ModuleOptions(NoiseOptions):
         choice = self.choice()
         return switched(noise_profile(self.noise), choice.on, choice.off)
 
-    def settings(self) -> dict[str, object]:
-        """Return seed, profile and effects as the settings of a results file state them."""
-        effects = {"with": list(self.with_effects or ()), "without": list(self.without_effects or ())}
-        return {"seed": self.seed, "noise": self.noise, **effects}
-
 
 @contextmanager
 def experiment(kept: str = "nothing is written") -> Iterator[Terminal]:

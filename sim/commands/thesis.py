@@ -16,10 +16,13 @@ from module_agent.model.errors import EXIT_FAILED
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
 from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
+from sim.thesis.dynamics.assistance_experiments import ASSISTANCE_EXPERIMENTS
+from sim.thesis.dynamics.gain_experiments import GAIN_EXPERIMENTS
 from sim.thesis.dynamics.parameter_experiments import PARAMETER_EXPERIMENTS
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
 from sim.thesis.future_work.experiment import FUTURE_WORK
 from sim.thesis.kinematics.equation16 import EQUATION_16
+from sim.thesis.kinematics.estimator_experiments import ESTIMATORS
 from sim.thesis.kinematics.motion_experiments import MOTION_EXPERIMENTS
 from sim.thesis.kinematics.repeat_experiments import REPEAT_EXPERIMENTS
 from sim.thesis.kinematics.sweep_experiments import SWEEP_EXPERIMENTS
@@ -37,8 +40,10 @@ _GROUPS = (
     MOTION_EXPERIMENTS,
     SWEEP_EXPERIMENTS,
     REPEAT_EXPERIMENTS,
-    (EQUATION_16,),
+    (EQUATION_16, ESTIMATORS),
     PARAMETER_EXPERIMENTS,
+    ASSISTANCE_EXPERIMENTS,
+    GAIN_EXPERIMENTS,
     (FUTURE_WORK,),
 )
 EXPERIMENTS: tuple[Experiment, ...] = tuple(sorted((one for own in _GROUPS for one in own), key=_place))

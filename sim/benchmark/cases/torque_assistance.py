@@ -7,11 +7,16 @@ from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.cases.arm import KNOWN
 from sim.benchmark.row import Row, count
 from sim.imperfections.noise_profile import noise_profile
-from sim.thesis.dynamics.torque_assistance import identified_model, standing_robot
-from sim.thesis.dynamics.torque_assistance_cases import ABOUT_AS_WELL, Combination, robots_of, try_case
+from sim.thesis.dynamics.torque_assistance import identified_model, standing_robot, true_model
+from sim.thesis.dynamics.torque_assistance_cases import (
+    ABOUT_AS_WELL,
+    MIN_GAIN,
+    Combination,
+    robots_of,
+    try_case,
+)
 from sim.thesis.dynamics.torque_assistance_cases import Case as Combined
 from sim.thesis.dynamics.torque_assistance_cases import cases as combinations
-from sim.thesis.dynamics.torque_assistance_report import MIN_GAIN, true_model
 
 NOISE = "x5"
 _IDENTIFY_COST_S, _CASE_COST_S = 12.0, 4.0

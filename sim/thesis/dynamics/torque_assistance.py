@@ -1,8 +1,8 @@
 """Torque assistance (thesis 6.3.2, 6.3.3): how joints follow a motion with and without calculated torque.
 
-The efforts come from chain and parameters as the system identifies them on the same modules on another day,
-and make up for what the motors take by the catalogue (`coordinator.torque_control.motor_compensation`). The
-true motion of the joints is compared with the commanded motion.
+The torques come from what is identified of the same modules on another day, and make up for what the motors
+take by the catalogue (`coordinator.torque_control.motor_compensation`), but for those of the thesis, A Phi
+alone. The true motion of the joints is compared with the commanded motion.
 """
 
 from collections.abc import Mapping
@@ -30,9 +30,11 @@ from module_agent.network_emulation.profile_file import network
 from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import Robot, load_robot
-from sim.robot.variants import at_random_site
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.robot.variants import as_built, at_random_site
 from sim.test_bench.module_bench import ExperimentFailed
 from sim.test_bench.robot_bench import BenchRobot, Streaming, Track
+from sim.thesis.dynamics.load_identification import Frame, wrench_rows
 from sim.thesis.kinematics.joint_trial import rms
 from sim.thesis.published import Reading, setting, thesis_gains, without_velocity
 from sim.virtual_time.robot import VirtualSettings
@@ -97,6 +99,43 @@ class Model(NamedTuple):
     chain: Chain
     phi: Array
 
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """The modules, in the order of a motion's columns."""
+        return self.chain.serials
+
+    @property
+    def compensates(self) -> bool:
+        """Whether the torques make up for the motors."""
+        return True
+
+    def set_points(self, motion: Reference) -> SetPoints:
+        """Return the spring torques along a motion."""
+        return feed_forward(self.chain, self.phi, motion)
+
+
+class LoadModel(NamedTuple):
+    """What is identified of the load of the first of a robot's modules, whose torque is A Phi (eq. 25).
+
+    phi: (10,) parameters. force_m_s2: (3,) specific force of rest at q = 0. frame: whether that force is
+    constant, as section 5.1 has it, or turns against the link. compensates: whether the torques make up for
+    the motor, too, which the thesis' do not.
+    """
+
+    serials: tuple[str, ...]
+    phi: Array
+    force_m_s2: Array
+    frame: Frame = "at rest"
+    compensates: bool = False
+
+    def set_points(self, motion: Reference) -> SetPoints:
+        """Return the load's torques along a motion, and none for the other modules."""
+        effort = np.zeros_like(motion.q_rad)
+        q, qd, qdd = (signal[:, 0] for signal in motion[1:])
+        rows = wrench_rows(q, qd, qdd, self.force_m_s2, self.frame)
+        effort[:, 0] = rows[:, -1] @ self.phi
+        return SetPoints(motion, read_only(effort))
+
 
 class Stage(NamedTuple):
     """A robot and its commanded motion; joints without a pattern hold their start position."""
@@ -109,7 +148,7 @@ class Stage(NamedTuple):
 class Follow(NamedTuple):
     """Tracking of a motion, over the joints that were commanded to move.
 
-    rms_error_rad: of the true position, over the whole motion. motion_rms_rad: of the motion about its mean.
+    rms_error_rad: of the true position, over the whole motion.
     ringing_rad: the largest standard deviation of a joint at the end of its rest afterwards.
     saturated: the largest share of the motion during which a bridge is at its limit. duty_jumps: the largest
     share of ticks in which a duty changes by half its range or more. unstable: the reason, empty if stable.
@@ -117,7 +156,6 @@ class Follow(NamedTuple):
     """
 
     rms_error_rad: float
-    motion_rms_rad: float
     ringing_rad: float
     saturated: float
     duty_jumps: float
@@ -141,6 +179,12 @@ def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | 
     return Model(identified.kinematics.fit.chain, identified.inertia.instrumental.fit.phi)
 
 
+def true_model(name: str, seed: int, noise: NoiseProfile) -> Model:
+    """Return the true model of a shipped robot as the seed builds and places it, not an identified one."""
+    robot = as_built(standing_robot(name, seed), seed, noise)
+    return Model(true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
+
+
 def standing_robot(name: str, seed: int) -> Robot:
     """Return a shipped robot at the place that the seed draws."""
     return at_random_site(load_robot(name), seed)
@@ -151,7 +195,7 @@ def follow(
     gains: Gains,
     mode: InputMode,
     delivery: Delivery,
-    model: Model,
+    model: Model | LoadModel,
     noise: NoiseProfile,
     seed: int,
 ) -> Follow:
@@ -170,7 +214,8 @@ def follow(
             bench.run(
                 {s: GoTo(target_rad=q, max_speed_rad_s=TRAVEL_RAD_S) for s, q in stage.start_rad.items()}
             )
-            points = _driven(points, kinds, sets, [bench.by_serial[s].winding_c for s in movers])
+            if model.compensates:
+                points = _driven(points, kinds, sets, [bench.by_serial[s].winding_c for s in movers])
             bench.set_gains(dict(zip(movers, sets, strict=True)))
             if delivery.network is None:
                 tracks = _on_module(bench, stage, points, mode)
@@ -185,6 +230,8 @@ def follow(
 
 def tracking(commanded: Reference, moving: Track, after: Track) -> Follow:
     """Return the tracking of a motion; columns are the joints that moved, `after` is the rest after it."""
+    if not all(np.isfinite(track.q_rad).all() for track in (moving, after)):
+        return _broken_off(commanded, "the simulated motion diverges")
     q = commanded.q_rad
     error = moving.q_rad[: len(q)] - q
     still = round(_STILL_S * 1e3)
@@ -198,7 +245,6 @@ def tracking(commanded: Reference, moving: Track, after: Track) -> Follow:
     )
     return Follow(
         rms_error_rad=rms(error),
-        motion_rms_rad=rms(q - q.mean(axis=0)),
         ringing_rad=ringing,
         saturated=saturated,
         duty_jumps=duty_jumps,
@@ -214,17 +260,16 @@ def _largest_share(when: NDArray[np.bool_]) -> float:
 
 def _broken_off(commanded: Reference, why: str) -> Follow:
     nothing = read_only(np.empty((0, commanded.q_rad.shape[1])))
-    motion = rms(commanded.q_rad - commanded.q_rad.mean(axis=0))
-    return Follow(np.inf, motion, np.inf, 1.0, 1.0, f"broken off: {why}", nothing, nothing)
+    return Follow(np.inf, np.inf, 1.0, 1.0, f"broken off: {why}", nothing, nothing)
 
 
-def _phases(stage: Stage, model: Model) -> list[SetPoints]:
+def _phases(stage: Stage, model: Model | LoadModel) -> list[SetPoints]:
     """Return the set-points of the joints that move: settling, the motion, the rest after it."""
-    serials = model.chain.serials
+    serials = model.serials
     motion = joint_reference(serials, stage.patterns, stage.start_rad)
     phases = (standing(motion, 0, SETTLE_S), motion, standing(motion, -1, SETTLE_S))
     columns = [serials.index(serial) for serial in stage.patterns]
-    return [_picked(feed_forward(model.chain, model.phi, each), columns) for each in phases]
+    return [_picked(model.set_points(each), columns) for each in phases]
 
 
 def _driven(

@@ -32,16 +32,18 @@ HOSTS = (
 FACTORY = (Gains(3), Gains(4))
 # Figure 53 and 54 have "a normal sine trajectory"; its size is not printed. This one asks for a peak of
 # 0.63 rad/s, under half of what the module can do.
-_SINE = MultiSine(sines=(Sine(amplitude_rad=0.2, frequency_hz=0.5),), duration_s=8.0)
+SINE = MultiSine(sines=(Sine(amplitude_rad=0.2, frequency_hz=0.5),), duration_s=8.0)
 # Table 6. The amplitude of 2 that the horizontal arm was excited with asks for 12.6 rad/s, nine times what
 # the module can do, so that no loop follows it; 0.2 is the vertical arm's.
 _PATTERN = DynamicPattern(amplitude_rad=0.2)
 # Which settings the thesis shows on a sine; the others on the windowed sine motion.
-_ON_SINE = ("#2", "#3")
+ON_SINE = ("#2", "#3")
 
 
 # Where an integral follows as well by itself. Measured 0.92 to 1.16 times the error without torque.
 ABOUT_AS_WELL = 1.25
+# The required gain of an arm of six joints under torque control.
+MIN_GAIN = 3.0
 
 
 class Pose(NamedTuple):
@@ -158,13 +160,13 @@ def stage_of(case: Case, seed: int) -> Stage:
 def _pattern(motion: Motion, alignment: Alignment) -> Pattern:
     if motion == "windowed sine":
         return WindowedSine(amplitude=thesis_length(alignment, LENGTH_MM).amplitude_rad)
-    return _SINE if motion == "sine" else _PATTERN
+    return SINE if motion == "sine" else _PATTERN
 
 
 def _thesis_cases(alignment: Alignment, reading: Reading, quick: bool) -> list[Case]:
     combinations = []
     for each in SETTINGS:
-        own: Motion = "sine" if each.name in _ON_SINE else "windowed sine"
+        own: Motion = "sine" if each.name in ON_SINE else "windowed sine"
         motions: tuple[Motion, ...] = (own,) if quick else (own, "pattern")
         gains = Gains(each.strategy, each.name, reading)
         combinations += [Case(thesis_robot(alignment), "", motion, gains, ON_MODULE) for motion in motions]

@@ -15,24 +15,29 @@ from coordinator.report.plots import panel_figure
 from sim.commands.thesis import EXPERIMENTS
 from sim.main import app
 from sim.robot.noise_choice import NoiseChoice
+from sim.thesis.dynamics.assistance_runs import Trials
 from sim.thesis.dynamics.pattern_recording import PatternSeries
 from sim.thesis.experiment import Check, Experiment, Scope, ThesisResults, Unit, concluded
 from sim.thesis.future_work.arm_sessions import ArmSessions, ChainErrors
 from sim.thesis.future_work.joint_trials import AlignedTrial
 from sim.thesis.kinematics.amplitude_sweep import AmplitudeTrial, Series
+from sim.thesis.kinematics.estimator_variants import VARIANTS, Arm, EstimatorRow
 from sim.thesis.kinematics.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector
 from sim.thesis.published import thesis_length
 from sim.thesis.study import Store, key, results, units_of
 from sim.thesis.study_report import counted, study_document
 from tests.sim.thesis.dynamics.printed_patterns import as_printed
+from tests.sim.thesis.dynamics.printed_trials import as_followed
 
 SCOPE = Scope(seed=0, noise=NoiseChoice("x5"), quick=True)
 SWEEPS = (*range(23, 27), *range(29, 33))
 FIGURES = (15, 16, 19, 20, 21, 22, *range(23, 44))
 DYNAMIC_FIGURES = (*range(44, 52), 58)
+ASSISTANCE_FIGURES = (*range(52, 58), 59, 60, 61)
 IDS = {
-    *(f"figure{number}" for number in (*FIGURES, *DYNAMIC_FIGURES)),
-    *("table4", "table5", "table6", "equation16", "chapter7.2"),
+    *(f"figure{number}" for number in (*FIGURES, *DYNAMIC_FIGURES, *ASSISTANCE_FIGURES)),
+    *(f"table{number}" for number in range(4, 10)),
+    *("equation16", "estimators", "section6.3.3.1", "chapter7.2"),
 }
 
 
@@ -106,6 +111,10 @@ def lengths(series: Series, shift_mm: float | None = None) -> list[AmplitudeTria
 def measured(unit: Unit) -> Any:
     if unit.kind is PatternSeries:
         return as_printed(*unit.arguments[:3])
+    if unit.kind == Trials:
+        return as_followed(*unit.arguments[:2])
+    if unit.kind == list[EstimatorRow]:
+        return estimates(unit.arguments[0])
     if unit.kind is TrialSignals:
         return signals(unit.arguments[2])
     if unit.kind is AlignedTrial:
@@ -114,6 +123,24 @@ def measured(unit: Unit) -> Any:
         errors = ChainErrors(1.0, 2.0)
         return ArmSessions(errors, errors, errors, None, errors, errors, 40.0, 10.0, 0.1, 0.02, 0.01)
     return lengths(unit.arguments[0])
+
+
+def estimates(arm: Arm) -> list[EstimatorRow]:
+    """An arm on which all estimators are better than the thesis'."""
+    return [
+        EstimatorRow(
+            arm.alignment,
+            arm.length_mm,
+            name,
+            1,
+            *(9.0 if name == "thesis" else 0.1,) * 3,
+            0.2,
+            0.1,
+            1.0,
+            1.0,
+        )
+        for name in VARIANTS
+    ]
 
 
 def explained(measured: list[list[AmplitudeTrial]]) -> list[list[AmplitudeTrial]]:

@@ -58,7 +58,7 @@ def _monitored(trial: Trial) -> MonitoredSegments:
 
 
 def _follow(rms: float, unstable: str = "") -> Follow:
-    return Follow(rms, 1.0, 0.0, 0.0, 0.0, unstable, np.empty((0, 1)), np.empty((0, 1)))
+    return Follow(rms, 0.0, 0.0, 0.0, unstable, np.empty((0, 1)), np.empty((0, 1)))
 
 
 def _assisted(trial: Trial) -> list[Combination]:

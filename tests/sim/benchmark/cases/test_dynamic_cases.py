@@ -125,7 +125,7 @@ def test_without_pinocchio_only_our_own_cost_is_judged() -> None:
 def assisted(rms: tuple[float, float, float], unstable: str = "") -> Combination:
     nothing = np.empty((0, 1))
     first, second, third = (
-        Follow(error, 1.0, 0.0, 0.0, 0.0, words, nothing, nothing)
+        Follow(error, 0.0, 0.0, 0.0, words, nothing, nothing)
         for error, words in zip(rms, ("", "", unstable), strict=True)
     )
     return Combination(Combined("arm6", "", "all joints", Gains(4), ON_MODULE), (first, second, third))

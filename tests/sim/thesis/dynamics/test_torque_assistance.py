@@ -1,37 +1,27 @@
 """Torque assistance on the thesis' arm: with what the arm identifies of itself, calculated torque helps."""
 
-import json
-import pickle
-from collections.abc import Callable, Sequence
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from coordinator.torque_control.feed_forward import Reference
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.errors import UsageError
-from sim.benchmark.case import Trial
-from sim.benchmark.workers import Done
-from sim.commands.assistance import assistance_table
-from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile
-from sim.main import app
+from sim.imperfections.noise_profile import NOISE_PROFILES
 from sim.test_bench.robot_bench import Track
 from sim.thesis.dynamics.torque_assistance import (
     MAX_RINGING_RAD,
     MAX_SATURATED,
     ON_MODULE,
-    Follow,
     Gains,
     Model,
     follow,
     identified_model,
     standing_robot,
     tracking,
+    true_model,
 )
 from sim.thesis.dynamics.torque_assistance_cases import (
     HOSTS,
@@ -44,7 +34,6 @@ from sim.thesis.dynamics.torque_assistance_cases import (
     thesis_robot,
     try_case,
 )
-from sim.thesis.dynamics.torque_assistance_report import bars, true_model, write_assistance
 from sim.thesis.published import setting, thesis_gains, without_velocity
 
 # Tests of this file share recorded runs: they stay in one process.
@@ -140,6 +129,14 @@ def test_a_joint_that_stays_away_from_its_goal_is_wrong_but_stable() -> None:
     assert found.unstable == ""
 
 
+def test_a_simulation_that_diverges_is_broken_off_and_has_no_error() -> None:
+    away = still()._replace(q_rad=np.full((1500, 1), np.nan))
+    for moving, after in ((away, still()), (still(), away)):
+        lost = tracking(COMMANDED, moving, after)
+        assert lost.rms_error_rad == np.inf
+        assert lost.unstable == "broken off: the simulated motion diverges"
+
+
 def test_a_joint_that_goes_on_in_a_cycle_is_unstable() -> None:
     cycle = 1.5 * np.sqrt(2.0) * MAX_RINGING_RAD * np.sin(2 * np.pi * 8.0 * COMMANDED.t_s[:, None])
     assert tracking(COMMANDED, still(), still()._replace(q_rad=cycle)).unstable == "rings by 3.0 mrad"
@@ -189,17 +186,7 @@ def test_an_unknown_setting_is_answered_with_those_that_there_are() -> None:
         setting("#7")
 
 
-# --------------------------------------------------------------------------- cases, table, command
-
-
-def result(rms_rad: float, unstable: str = "") -> Follow:
-    nothing = np.empty((0, 1))
-    return Follow(rms_rad, 0.1, 0.0, 0.0, 0.0, unstable, nothing, nothing)
-
-
-def combination(case: Case, *rms_rad: float, unstable: str = "") -> Combination:
-    first, second, third = rms_rad
-    return Combination(case, (result(first), result(second), result(third, unstable)))
+# --------------------------------------------------------------------------- cases
 
 
 def test_every_setting_is_tried_on_both_alignments_and_in_both_readings() -> None:
@@ -212,89 +199,9 @@ def test_every_setting_is_tried_on_both_alignments_and_in_both_readings() -> Non
         assert stage_of(case, SEED).patterns
 
 
-def test_a_bar_is_kept_by_the_stable_ones_and_names_all_others() -> None:
-    arm = Case("arm6", "home", "all joints", Gains(4), ON_MODULE)
-    found = [
-        combination(CASE_4, 0.3, 0.2, 0.1),
-        combination(CASE_4._replace(motion="sine"), 0.3, 0.05, 0.1),
-        combination(CASE_4._replace(motion="pattern"), 0.3, 0.2, 0.4, unstable="rings by 9.0 mrad"),
-        combination(CASE_4._replace(gains=Gains(3)), 0.3, 0.2, 0.1),
-        combination(arm, 0.3, 0.29, 0.1),
-    ]
-    one, factory, six = bars(found)
-    assert (one.holds, one.stable, one.met) == (False, 2, 1)
-    assert one.missed == ("vertical, #4 per tick, sine",)
-    assert one.unstable == ("vertical, #4 per tick, pattern: rings by 9.0 mrad",)
-    assert (factory.holds, factory.stable) == (True, 1)
-    # 2.9 times is not three times.
-    assert (six.holds, six.missed) == (False, ("arm6 home, factory S4, all joints",))
-    assert assistance_table(found).row_count == 5
-
-
-def test_what_was_broken_off_is_written_without_a_number(tmp_path: Path) -> None:
-    file = tmp_path / "a.json"
-    write_assistance(file, {"seed": 1}, [combination(CASE_4, 0.3, 0.2, np.inf, unstable="broken off: x")])
-    (row,) = json.loads(file.read_text(encoding="utf-8"))["rows"]
-    assert row["modes"]["3"]["rms_error_rad"] is None
-    assert row["modes"]["3"]["unstable"] == "broken off: x"
-    assert row["modes"]["1"]["rms_error_rad"] == 0.3
-
-
 def test_what_a_robot_identifies_of_itself_helps_nearly_as_much_as_the_truth() -> None:
     true = follow(
         stage_of(CASE_4, SEED), CASE_4.gains, 3, ON_MODULE, true_model(VERTICAL, SEED, X5), X5, SEED
     )
     # Both are left with the friction of the single module; the model's error is under a percent of 2.3 Nm.
     assert tried(CASE_4).follows[2].rms_error_rad < 1.5 * true.rms_error_rad
-
-
-def through_a_pipe(
-    trials: Sequence[Trial], processes: int, on_done: Callable[[int, Any], None]
-) -> list[Done]:
-    """Do all trials here; what goes to another process and back must survive being pickled."""
-    done = []
-    for index, trial in enumerate(trials):
-        arguments = pickle.loads(pickle.dumps(trial.arguments))
-        done.append(Done(pickle.loads(pickle.dumps(trial.work(*arguments))), 0.0))
-        on_done(index, done[-1].result)
-    return done
-
-
-def test_the_command_identifies_follows_prints_and_draws(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[tuple[str, int]] = []
-
-    def identified(name: str, profile: NoiseProfile, seed: int) -> Model:
-        asked.append((name, seed))
-        return vertical()
-
-    program = "sim.commands.assistance"
-    monkeypatch.setattr(f"{program}.cases", lambda quick: [CASE_4])
-    monkeypatch.setattr("sim.commands.experiment.run_trials", through_a_pipe)
-    monkeypatch.setattr(f"{program}.identify_robot", identified)
-    file, picture = tmp_path / "a.json", tmp_path / "a.png"
-    done = CliRunner().invoke(app, ["assistance", "--json", str(file), "--picture", str(picture)])
-    assert done.exit_code == 0, done.output
-    assert asked == [(VERTICAL, 0)]
-    assert "times): holds, in 1 of 1 stable" in done.output
-    written = json.loads(file.read_text(encoding="utf-8"))
-    assert written["settings"] == {"seed": 0, "noise": "x5", "with": [], "without": [], "quick": False}
-    (row,) = written["rows"]
-    # The same seed follows the same way twice, to the last bit.
-    assert row["modes"]["3"]["rms_error_rad"] == tried(CASE_4).follows[2].rms_error_rad
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--noise", "loud"], "unknown noise profile 'loud'"),
-        (["--with", "rain"], "unknown effect 'rain'"),
-        (["--picture", "/no/such/folder/x.png"], "there is no folder /no/such/folder"),
-    ],
-)
-def test_wrong_usage_says_what_is_wrong(arguments: list[str], words: str) -> None:
-    done = CliRunner().invoke(app, ["assistance", *arguments])
-    assert done.exit_code == 2
-    assert words in done.output

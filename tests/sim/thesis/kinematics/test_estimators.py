@@ -1,21 +1,17 @@
-"""The comparison of estimators: what they make of one recording, the table, and the command."""
-
-import json
-from pathlib import Path
+"""The comparison of estimators: what they make of one recording, and what is concluded from many."""
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from coordinator.excitation.plan import Plan
 from module_agent.estimate.windows import JointWindow
-from sim.commands.estimators import estimator_table
 from sim.imperfections.noise_profile import NOISE_PROFILES, switched
-from sim.main import app
+from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import sensing_chain
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import OneJointRig
+from sim.thesis.kinematics.estimator_experiments import ESTIMATORS, arm_rows
 from sim.thesis.kinematics.estimator_variants import (
     VARIANTS,
     Arm,
@@ -65,43 +61,29 @@ def test_rows_are_means_and_roots_of_what_was_found() -> None:
     assert ours.bias_mm == pytest.approx(0.1)
     assert ours.ratio == pytest.approx(np.sqrt(5.0))
     assert ours.covered == 0.5
-    assert estimator_table([thesis, ours]).row_count == 2
 
 
-def test_the_command_prints_the_table_and_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arm = Arm("vertical", 171)
-    monkeypatch.setattr("sim.commands.estimators.ARMS", (arm,))
-    file = tmp_path / "table.json"
-    arguments = [
-        "estimators",
-        "--trials",
-        "1",
-        "--processes",
-        "1",
-        "--without",
-        "base-shake",
-        "--json",
-        str(file),
-    ]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    assert "171 mm vertical" in result.output
-    written = json.loads(file.read_text(encoding="utf-8"))
-    assert written["settings"]["without"] == ["base-shake"]
-    rows = {row["estimator"]: EstimatorRow(**row) for row in written["rows"]}
-    assert set(rows) == set(VARIANTS)
-    assert rows["encoder"].mean_error_mm < 0.6 < rows["thesis"].mean_error_mm
+def test_the_trials_of_an_arm_depend_on_its_seed_alone() -> None:
+    rows = arm_rows(Arm("vertical", 171), 1, NoiseChoice("x5", off=("base-shake",)), 0)
+    assert rows == arm_rows(Arm("vertical", 171), 1, NoiseChoice("x5", off=("base-shake",)), 0)
+    by_name = {row.estimator: row for row in rows}
+    assert set(by_name) == set(VARIANTS)
+    assert by_name["encoder"].mean_error_mm < 0.6 < by_name["thesis"].mean_error_mm
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--noise", "loud"], "unknown noise profile 'loud'"),
-        (["--without", "rain"], "unknown effect 'rain'"),
-        (["--json", "/no/such/folder/x.json"], "there is no folder /no/such/folder"),
-    ],
-)
-def test_wrong_usage_says_what_is_wrong(arguments: list[str], words: str) -> None:
-    result = CliRunner().invoke(app, ["estimators", *arguments])
-    assert result.exit_code == 2
-    assert words in result.output
+def test_estimates_that_err_more_or_claim_too_little_are_not_seen() -> None:
+    def row(estimator: str, rms_mm: float, covered: float) -> EstimatorRow:
+        return EstimatorRow(
+            "vertical", 171, estimator, 5, rms_mm, 0.0, rms_mm, 0.1, 0.1, rms_mm / 0.1, covered
+        )
+
+    def outcome(rms_mm: float, covered: float) -> str:
+        horizontal = [each._replace(alignment="horizontal") for each in (row("thesis", 2.0, 1.0),)]
+        own = row("encoder", rms_mm, covered)
+        return ESTIMATORS.result(
+            [[row("thesis", 2.0, 1.0), own], [*horizontal, own._replace(alignment="horizontal")]]
+        ).outcome
+
+    assert outcome(0.1, 0.8) == "seen"
+    assert outcome(0.1, 0.7) == outcome(2.1, 0.8) == "seen in part"
+    assert outcome(2.1, 0.7) == "not seen"
