@@ -105,18 +105,25 @@ def _table(rows: Sequence[EstimatorRow]) -> Table:
 
 
 def _plot(rows: Sequence[EstimatorRow]) -> Plot:
+    # The thesis' method errs by so much more that its variants need panels of their own.
+    kinds = (
+        ("", tuple(VARIANTS)),
+        (", regressions alone", tuple(name for name in VARIANTS if name != _THESIS)),
+    )
     panels = tuple(
-        Panel(y_label="rms error [mm]", curves=_curves(rows, alignment), title=alignment)
+        Panel(y_label="rms error [mm]", curves=curves, title=f"{alignment}{remark}")
         for alignment in ALIGNMENTS
+        for remark, names in kinds
+        if (curves := _curves(rows, alignment, names))
     )
     return Plot(
         caption="Rms error of the radial distance by estimator.", x_label="length [mm]", panels=panels
     )
 
 
-def _curves(rows: Sequence[EstimatorRow], alignment: Alignment) -> tuple[Curve, ...]:
+def _curves(rows: Sequence[EstimatorRow], alignment: Alignment, names: Sequence[str]) -> tuple[Curve, ...]:
     curves = []
-    for name in VARIANTS:
+    for name in names:
         own = [row for row in rows if (row.alignment, row.estimator) == (alignment, name)]
         x, y = tuple(float(row.length_mm) for row in own), tuple(row.rms_mm for row in own)
         curves.append(Curve(label=name, x=x, y=y, style="points"))
