@@ -138,16 +138,18 @@ def test_a_stop_by_somebody_else_a_dead_agent_and_a_large_error_stop_all_modules
 def test_a_robot_follows_better_with_what_it_identified_of_itself(
     rigs: Callable[..., Any], tmp_path: Path
 ) -> None:
-    arm = "thesis_171_vertical"
+    # Its joint carries no weight: what its torque sensor reads at rest is the sensor's offset, which$
+    # would move it if it were followed.
+    arm = "thesis_171_horizontal"
     plan = Plan(discover_s=0.3, link_s=0.3, settle_s=0.3, rest_s=1.0, travel_speed_rad_s=1.5)
-    run_virtual(VirtualConfig(load_robot(arm), tmp_path / "run", noise="x5", plan=plan))
+    run_virtual(VirtualConfig(load_robot(arm), tmp_path / "run", noise="x5-uncalibrated", plan=plan))
     identified = gravity_model(tmp_path / "run")
     path = tmp_path / "m.csv"
     path.write_text(motion_file(path).read_text().replace(f"q_{LIFT}_rad", "q_X-00009_rad"))
     path.write_text(path.read_text().replace(f"q_joint_{ELBOW}_rad", "ignored"))
-    rig = rigs(arm, "lan")
+    rig = rigs(arm, "lan", noise="x5-uncalibrated")
     following, _ = session(rig, identified, path)
     position, velocity, torque = (mode.joints[0].rms_rad for mode in rig.run(following.run()).modes)
-    # Measured: 0.115 and 0.027 times; the bounds are those of the robot that is known without error.
+    # Measured: 0.07 times, and half of that; twice as much where the offset is followed.
     assert velocity < 0.35 * position
-    assert torque < 0.12 * position
+    assert torque < 0.75 * velocity
