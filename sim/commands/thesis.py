@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from coordinator.report.plots import check_plots
@@ -21,6 +22,7 @@ from sim.thesis.dynamics.gain_experiments import GAIN_EXPERIMENTS
 from sim.thesis.dynamics.parameter_experiments import PARAMETER_EXPERIMENTS
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
 from sim.thesis.future_work.experiment import FUTURE_WORK
+from sim.thesis.kinematics.configuration_experiments import CONFIGURATION_EXPERIMENTS
 from sim.thesis.kinematics.equation16 import EQUATION_16
 from sim.thesis.kinematics.estimator_experiments import ESTIMATORS
 from sim.thesis.kinematics.motion_experiments import MOTION_EXPERIMENTS
@@ -37,6 +39,7 @@ def _place(one: Experiment) -> tuple[int, int]:
 
 
 _GROUPS = (
+    CONFIGURATION_EXPERIMENTS,
     MOTION_EXPERIMENTS,
     SWEEP_EXPERIMENTS,
     REPEAT_EXPERIMENTS,
@@ -129,5 +132,5 @@ def outcome_table(experiments: Sequence[ExperimentResult]) -> Table:
     """Return the experiments with their outcomes and reasons."""
     shown = new_table("The thesis' experiments on simulated modules", "experiment | outcome | reason")
     for one in experiments:
-        shown.add_row(one.title, one.outcome, one.reason)
+        shown.add_row(one.title, one.outcome, escape(one.reason))
     return shown

@@ -1,5 +1,6 @@
 """The thesis' experiments: none is missing, each shows data and an outcome, the command keeps its results."""
 
+import io
 import json
 from html import unescape
 from pathlib import Path
@@ -8,11 +9,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from coordinator.report.document import Conclusion, Paragraph, figures, linked, tables
 from coordinator.report.plots import panel_figure
-from sim.commands.thesis import EXPERIMENTS
+from sim.commands.thesis import EXPERIMENTS, outcome_table
 from sim.main import app
 from sim.robot.noise_choice import NoiseChoice
 from sim.thesis.dynamics.assistance_runs import Trials
@@ -36,7 +38,7 @@ DYNAMIC_FIGURES = (*range(44, 52), 58)
 ASSISTANCE_FIGURES = (*range(52, 58), 59, 60, 61)
 IDS = {
     *(f"figure{number}" for number in (*FIGURES, *DYNAMIC_FIGURES, *ASSISTANCE_FIGURES)),
-    *(f"table{number}" for number in range(4, 10)),
+    *(f"table{number}" for number in range(1, 10)),
     *("equation16", "estimators", "section6.3.3.1", "chapter7.2"),
 }
 
@@ -169,7 +171,9 @@ def test_each_experiment_has_an_outcome_with_its_reason_and_plots_with_data(each
         result.finding
     )
     assert result.reason
-    assert result.plots
+    # Tables 1 to 3 are the configuration.
+    assert result.plots or each.id in ("table1", "table2", "table3")
+    assert result.plots or result.tables[0].rows
     for plot in result.plots:
         assert plot.panels
         for panel in plot.panels:
@@ -351,3 +355,10 @@ def test_an_experiment_that_is_not_there_is_refused_with_the_list() -> None:
     done = CliRunner().invoke(app, ["thesis", "--only", "figure99"])
     assert done.exit_code == 2
     assert "no experiment 'figure99'; there are figure15," in " ".join(str(done.output).split())
+
+
+def test_units_in_brackets_reach_the_terminal() -> None:
+    chosen = [each for each in EXPERIMENTS if each.id == "table1"]
+    shown = io.StringIO()
+    Console(file=shown, width=200).print(outcome_table([each.result([]) for each in chosen]))
+    assert "diameter [mm]: 51" in shown.getvalue()
