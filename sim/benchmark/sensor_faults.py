@@ -102,15 +102,12 @@ class _Kept(Recording):
 
 def fault_trial(fault: str, seed: int, plan: Plan) -> FaultTrial:
     """Record the robot of a seed, identify it with a fault, and compare links and findings with the truth."""
-    this, profile = FAULTS[fault], noise_profile(NOISE)
-    robot = at_random_site(as_built(load_robot(ROBOT), seed, profile), seed)
-    robot = softened(robot, this.stiffness_nm_rad) if this.stiffness_nm_rad else robot
-    settings = VirtualSettings(robot, network("lan"), seed, profile, imu_rate_hz=this.imu_rate_hz)
+    this = FAULTS[fault]
+    robot = _robot(seed, this.stiffness_nm_rad)
     drawn = np.random.default_rng(seed).permutation(len(robot.serials))[: this.concerns or None]
     ill = tuple(robot.serials[k] for k in sorted(drawn.tolist()))
-    recording = _Kept()
     try:
-        record_session(settings, plan, recording=recording)
+        recording = _recorded(seed, plan, this.stiffness_nm_rad, this.imu_rate_hz)
         altered = _altered(recording, this, ill)
         kinematics = identify_kinematics(altered)
     except RobotError as error:

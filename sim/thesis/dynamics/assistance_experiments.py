@@ -196,8 +196,9 @@ def _reading(figure: _Figure, trials: Trials, arms: Sequence[Trial]) -> tuple[st
     motion = (
         "The sine's size is not printed: 0.2 rad at 0.5 Hz is taken."
         if figure.setting in ON_SINE
-        else "The motion is the windowed sine of table 6, as 6.3.1 says, at 0.2 rad: the 2 rad that the "
-        "horizontal arm is identified with ask for nine times the module's speed."
+        else "The motion is the windowed sine of table 6, as 6.3.1 says, with A = 0.2 rad, of which "
+        "its narrow window leaves 0.07 rad: the 2 rad that the horizontal arm is identified with ask for "
+        "nine times the module's speed."
     )
     ours = (
         f"Ours errs by {error_text(arms[0], 'ours')} mrad, A Φ alone by {error_text(arms[0], '3')} mrad: "

@@ -6,7 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.excitation.plan import Plan
+from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import CATALOGUE
+from sim.benchmark import sensor_faults
 from sim.benchmark.case import Case, CaseResult, Summary, concluded
 from sim.benchmark.cases.arm import (
     ARMS,
@@ -40,6 +43,7 @@ from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import LinkErrors, link_errors
 from sim.thesis.kinematics.joint_trial import JointTrial
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM
+from sim.virtual_time.robot import VirtualSettings
 
 
 def rows(summary: Summary) -> dict[str, Row]:
@@ -453,3 +457,15 @@ def test_a_wrong_type_puts_the_housing_where_it_is_not() -> None:
     away_m = np.linalg.norm(np.subtract(CATALOGUE["X5-9-old"].imu_xyz, CATALOGUE["X5-4"].imu_xyz))
     # The distance from the axis has no part along the axis.
     assert 0.05 < errors.vector_m <= away_m
+
+
+def test_faults_of_one_seed_share_a_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded: list[int] = []
+
+    def record(settings: VirtualSettings, plan: Plan, recording: Recording) -> None:
+        recorded.append(settings.seed)
+
+    monkeypatch.setattr(sensor_faults, "record_session", record)
+    for seed in (901, 901, 902):
+        assert "rest" in sensor_faults.fault_trial("none", seed, Plan()).text
+    assert recorded == [901, 902]

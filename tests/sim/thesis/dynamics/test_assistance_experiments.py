@@ -93,7 +93,8 @@ def test_a_horizontal_arm_that_is_stable_under_every_condition_is_not_seen() -> 
         return trial._replace(ways={way: one._replace(unstable="") for way, one in trial.ways.items()})
 
     reason = result("section6.3.3.1", FULL, stable).reason
-    assert "as read, 0 of 4 are" in reason.partition("Does not hold")[2]
+    assert "as read, 0 of 4 settings" in reason.partition("Does not hold")[2]
+    assert "with play in the gear, 0 of 4 are" in reason.partition("Does not hold")[2]
 
 
 def test_motions_that_the_simulation_loses_are_named() -> None:
@@ -101,7 +102,11 @@ def test_motions_that_the_simulation_loses_are_named() -> None:
         return changed(trial, mode_3=Tracked(None, "broken off: the simulated motion diverges", ()))
 
     assert not any("diverges" in text for text in result("section6.3.3.1", FULL).reading)
-    assert "In 24 of all cases" in result("section6.3.3.1", FULL, lost).reading[-1]
+    broken = result("section6.3.3.1", FULL, lost)
+    assert "In 24 of all cases" in broken.reading[-1]
+    # What is lost is no evidence that an arm is unstable.
+    assert "with play in the gear, 2 of 4 are" in broken.reason
+    assert broken.outcome != "seen"
 
 
 def test_a_full_form_tries_readings_springs_motions_and_arms_that_a_quick_one_does_not() -> None:
