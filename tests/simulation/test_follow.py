@@ -138,7 +138,7 @@ def test_a_stop_by_somebody_else_a_dead_agent_and_a_large_error_stop_all_modules
 def test_a_robot_follows_better_with_what_it_identified_of_itself(
     rigs: Callable[..., Any], tmp_path: Path
 ) -> None:
-    # Its joint carries no weight: what its torque sensor reads at rest is the sensor's offset, which$
+    # Its joint carries no weight: what its torque sensor reads at rest is the sensor's offset, which
     # would move it if it were followed.
     arm = "thesis_171_horizontal"
     plan = Plan(discover_s=0.3, link_s=0.3, settle_s=0.3, rest_s=1.0, travel_speed_rad_s=1.5)

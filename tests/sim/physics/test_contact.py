@@ -11,7 +11,7 @@ from sim.robot.robot_tree import build_tree
 from sim.world.world import World
 
 FAR_FLOOR = Obstacle(name="floor", floor=True, xyz_m=(0.0, 0.0, -3.0))
-# Its near face is 200 mm beside the joint: a hanging arm's last housing meets it at 1.23 rad below level.
+# Its near face is 200 mm from the joint: a hanging arm's last housing meets it at 1.23 rad below level.
 WALL = Obstacle(name="wall", box_m=(0.1, 1.0, 0.8), xyz_m=(0.25, 0.0, -0.45), friction=0.0)
 
 
