@@ -175,20 +175,18 @@ def check_motion(motion: Motion, limits: Limits) -> None:
 
 def _check_speed(speed_rad_s: float, limits: Limits) -> None:
     """Refuse what is probably a unit error; the loops clamp slower speeds to what the motor can follow."""
-    if speed_rad_s > ABSURD_SPEED * limits.max_speed_rad_s:
-        raise WireError(
-            Refusal.LIMIT,
-            f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
-            f"{limits.max_speed_rad_s:.2f} rad/s",
-        )
+    _check_size(speed_rad_s, ABSURD_SPEED, limits.max_speed_rad_s, "rad/s")
 
 
 def _check_effort(effort_nm: float, limits: Limits) -> None:
-    if effort_nm > ABSURD_EFFORT * limits.max_effort_nm:
+    _check_size(effort_nm, ABSURD_EFFORT, limits.max_effort_nm, "Nm")
+
+
+def _check_size(value: float, times: float, most: float, unit: str) -> None:
+    if value > times * most:
         raise WireError(
             Refusal.LIMIT,
-            f"{effort_nm:.1f} Nm is over {ABSURD_EFFORT:.0f} times what this module can do, "
-            f"{limits.max_effort_nm:.2f} Nm",
+            f"{value:.1f} {unit} is over {times:.0f} times what this module can do, {most:.2f} {unit}",
         )
 
 

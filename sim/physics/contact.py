@@ -36,12 +36,8 @@ def collision_text(shape: Shape, origin: str) -> str:
     return f"<collision>{origin}<geometry>{form}</geometry></collision>"
 
 
-def add_obstacles(engine: Any, client: int, obstacles: Sequence[Obstacle]) -> list[int]:
-    """Put obstacles into a physics client; return their numbers there."""
-    return [_added(engine, client, obstacle) for obstacle in obstacles]
-
-
 def _added(engine: Any, client: int, obstacle: Obstacle) -> int:
+    """Put an obstacle into a physics client; return its number there."""
     shape = obstacle.shape
     match shape.kind:
         case "box":
@@ -72,7 +68,7 @@ class Contacts:
         self._engine, self._client, self._body = engine, client, body
         self._names = ("the base", *skeleton.names)
         self._obstacles = obstacles
-        self._numbers = add_obstacles(engine, client, obstacles)
+        self._numbers = [_added(engine, client, obstacle) for obstacle in obstacles]
         # Friction of a pair is the product of both: the obstacle's alone shall count.
         for link in range(_WORLD, len(skeleton.names)):
             engine.changeDynamics(body, link, lateralFriction=1.0, physicsClientId=client)
