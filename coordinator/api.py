@@ -27,7 +27,7 @@ from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
-from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import await_modules
 from coordinator.live_robot.messenger import Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
@@ -381,9 +381,7 @@ async def connect(
     messenger = Messenger(
         transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, _recorder(recording)
     )
-    live = LiveRobot(
-        messenger, ModuleGroup(messenger, recording, time.monotonic_ns, sender_name()), recording
-    )
+    live = LiveRobot(messenger, ModuleGroup(messenger, recording, time.monotonic_ns, new_sender()), recording)
     try:
         messenger.start()
         await live.group.meet(await _present(messenger, robot, expect, timeout_s))

@@ -6,6 +6,7 @@ import secrets
 import signal
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,7 +21,8 @@ from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageEr
 from module_agent.network_emulation.impaired_transport import inject
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.profile_file import network as network_named
-from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from module_agent.transport.credentials import Credentials, host_credentials
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT, OPEN_TO_ALL, is_loopback
 from module_agent.transport.transport import NoHub, Transport
 from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.keys import check_chunk
@@ -50,15 +52,28 @@ def _stop(number: int, _frame: FrameType | None) -> None:
     raise Stopped(0 if number == signal.SIGTERM else 130)
 
 
-def _transport(connect: list[str], listen: list[str], network: NetworkProfile, seed: int) -> Transport:
+def _transport(
+    connect: list[str],
+    listen: list[str],
+    network: NetworkProfile,
+    seed: int,
+    credentials: Credentials | None,
+) -> Transport:
     """Open the session, waiting for the hub as long as it takes; a signal ends the waiting.
 
     Raises:
         TransportError: an endpoint is wrong, or taken; waiting would not help.
     """
     config = ZenohConfig(
-        mode="client", connect=tuple(connect), listen=tuple(listen), connect_timeout_s=CONNECT_ATTEMPT_S
+        mode="client",
+        connect=tuple(connect),
+        listen=tuple(listen),
+        connect_timeout_s=CONNECT_ATTEMPT_S,
+        credentials=credentials,
     )
+    for endpoint in (*connect, *listen):
+        if credentials is None and not is_loopback(endpoint):
+            typer.echo(f"x5-agent: {endpoint} is open to the network: {OPEN_TO_ALL}", err=True)
     reported = False
     while True:
         try:
@@ -89,6 +104,12 @@ def main(
     lifetime_ms: Annotated[float, typer.Option(min=1.0, max=1000.0, help="Command lifetime [ms].")] = 250.0,
     expiry: Annotated[str, typer.Option(help="On expiry: motor_off, hold or damping.")] = "motor_off",
     strategy: Annotated[int, typer.Option(min=0, max=4, help="Control strategy at start.")] = 3,
+    secure: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Speak mutual TLS with the keys in this folder (x5-coordinator keys)."
+        ),
+    ] = None,
     imu: Annotated[ImuKind, typer.Option(help="Calibration of the modules' IMUs.")] = "uncalibrated",
 ) -> None:
     """Run the agent of one or several modules until the world ends or a signal comes."""
@@ -105,7 +126,8 @@ def main(
             injected = network_named(network)
             if expiry not in ("motor_off", "hold", "damping"):
                 raise UsageError(f"--expiry {expiry}: it must be motor_off, hold or damping")
-            transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed)
+            known = host_credentials(secure, robot, serial) if secure else None
+            transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed, known)
             opened.callback(transport.close)
             # A full collection of what the imports have left takes 38 ms, in which no tick would run: it is
             # made once, and they are not looked at again.

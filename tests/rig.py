@@ -10,7 +10,7 @@ import numpy as np
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
-from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.messenger import Messenger, Sender
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Recording
 from coordinator.session.run import Run, RunConfig
@@ -23,6 +23,7 @@ from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.world.truth import write_truth
 
 T = TypeVar("T")
+SECRET = b"a-secret-of-16-b"
 
 
 class Notes:
@@ -131,16 +132,15 @@ class Rig(VirtualRobot):
 
     def group(self, sender: str = "tester") -> tuple[Messenger, Recording, ModuleGroup]:
         """A coordinator's hold on the robot."""
-        recording = Recording()
-        messenger = Messenger(
-            _Cuttable(self, self.endpoint(sender)),
-            self.robot.name,
-            lambda: self.loop.now_ns,
-            self.loop.call_soon,
-            recording.accept,
-        )
+        recording, loop = Recording(), self.loop
+
+        def clock() -> int:
+            return loop.now_ns
+
+        way = _Cuttable(self, self.endpoint(sender))
+        messenger = Messenger(way, self.robot.name, clock, loop.call_soon, recording.accept)
         messenger.start()
-        return messenger, recording, ModuleGroup(messenger, recording, lambda: self.loop.now_ns, sender)
+        return messenger, recording, ModuleGroup(messenger, recording, clock, Sender(sender, SECRET))
 
     def session(self, out: Path, plan: Plan, resume: bool = False, sender: str = "coordinator") -> Result:
         """Run a whole identification and write its folder, truth included."""
@@ -160,7 +160,13 @@ class Rig(VirtualRobot):
         """Make a coordinator that is to run a whole identification."""
         notes = Notes()
         config = RunConfig(
-            self.robot.name, out, sender, plan, expect or len(self.serials), resume=resume, inline=True
+            self.robot.name,
+            out,
+            Sender(sender, SECRET),
+            plan,
+            expect or len(self.serials),
+            resume=resume,
+            inline=True,
         )
         run = Run(
             config,

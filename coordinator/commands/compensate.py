@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.compensate_view import CompensationView
 from coordinator.commands.options import AsJson, ConnectOptions, DynamicsFolder, Speed
-from coordinator.live_robot.connection import open_connection, sender_name
+from coordinator.commands.views.compensation import CompensationView
+from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.runtime.command_line import fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal
@@ -67,7 +67,7 @@ def compensate_robot(
     view = CompensationView(model.chain.serials, loop.time, as_json, at.quiet)
     with view:
         session = CompensationSession(
-            transport, place.robot, model, plan, loop.clock_ns, loop.call_soon_threadsafe, view, sender_name()
+            transport, place.robot, model, plan, loop.clock_ns, loop.call_soon_threadsafe, view, new_sender()
         )
 
         def ends() -> bool:

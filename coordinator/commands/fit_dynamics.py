@@ -15,8 +15,8 @@ from coordinator.arm_fit.payload import KnownPayload
 from coordinator.arm_fit.predictions import write_matrices, write_predictions
 from coordinator.arm_fit.problem import ModelChoice
 from coordinator.arm_fit.report import write_report
-from coordinator.commands.fit_dynamics_tables import notes, page, tables
 from coordinator.commands.options import Quiet
+from coordinator.commands.views.fit_dynamics import notes, page, tables
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
 from coordinator.report.pages import html_page

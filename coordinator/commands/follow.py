@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from coordinator.commands.options import AsJson, ConnectOptions, DynamicsFolder, Speed
-from coordinator.live_robot.connection import open_connection, sender_name
+from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.runtime.command_line import in_a_folder, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal, new_table, print_table
@@ -76,7 +76,7 @@ def follow(
             loop.clock_ns,
             loop.call_soon_threadsafe,
             terminal,
-            sender_name(),
+            new_sender(),
         )
         result = attend(loop, session.run())
     file = result_path(baseline, out)

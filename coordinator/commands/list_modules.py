@@ -3,7 +3,7 @@
 import typer
 
 from coordinator.commands.options import AsJson, ConnectOptions, Expect
-from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import AS_HUB_S, Search, listed, stop_robot
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal, new_table
@@ -41,7 +41,7 @@ def stop(at: ConnectOptions, expect: Expect = None) -> None:
     """
     place = at.place()
     transport, search = _open_search(place, at.quiet, expect)
-    stopped, silent = stop_robot(transport, place.robot, sender_name(), search)
+    stopped, silent = stop_robot(transport, place.robot, new_sender().name, search)
     Terminal(at.quiet).note(f"stopped: {', '.join(stopped) or 'none'}")
     _check(place.robot, len(stopped), expect, "confirmation", silent)
 

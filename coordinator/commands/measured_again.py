@@ -18,7 +18,7 @@ from coordinator.commands.options import (
 )
 from coordinator.commands.run import run_attended
 from coordinator.excitation.plan import Plan
-from coordinator.live_robot.connection import sender_name
+from coordinator.live_robot.connection import new_sender
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal, new_table
 from coordinator.session.run import RunConfig
@@ -100,8 +100,6 @@ def measured_again(
         raise UsageError("give either --out, to measure the robot, or --measured, a run to compare with")
     place = at.place(before.name)
     short = plan(before, planned(again.plan))
-    config = RunConfig(
-        robot=place.robot, out=again.out, sender=sender_name(), plan=short, expect=again.expect
-    )
+    config = RunConfig(robot=place.robot, out=again.out, sender=new_sender(), plan=short, expect=again.expect)
     with Terminal(at.quiet) as terminal:
         return run_attended(config, place, again.speed, terminal, advice="")[1]

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from coordinator.baseline.baseline_robot import load_baseline
-from coordinator.commands.monitor_view import MonitorScreen
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
-from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.commands.views.monitor import MonitorScreen
+from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.messenger import Messenger
 from coordinator.monitoring.live import UPDATE_S, LiveMonitor, retained_rows
 from coordinator.monitoring.monitor import Monitor
@@ -103,7 +103,7 @@ def _monitor_live(
     transport = open_connection(place, Terminal().note).transport
     loop = ScaledLoop(speed)
     screen.start_ns = loop.clock_ns()
-    live = LiveMonitor(monitor, loop.clock_ns, sender_name(), screen.report)
+    live = LiveMonitor(monitor, loop.clock_ns, new_sender().name, screen.report)
     messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
 
     def after_ns(seconds: float) -> int:

@@ -15,6 +15,7 @@ from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.model.errors import UsageError
 from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.profile_file import network as network_named
+from module_agent.transport.credentials import COORDINATOR, OBSERVER, load_credentials
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.keys import check_chunk
 
@@ -32,6 +33,12 @@ Speed = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 WithReport = Annotated[
     bool, typer.Option("--report/--no-report", help="Write a page for people, report.html, into the folder.")
+]
+Secure = Annotated[
+    Path | None,
+    typer.Option(
+        "--secure", metavar="DIR", help="Speak mutual TLS with the keys in this folder (`keys` makes it)."
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
 
@@ -54,17 +61,20 @@ class ConnectOptions:
         str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}, or a TOML file.")
     ] = "none"
     seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0
+    secure: Secure = None
     quiet: Quiet = False
 
     def place(self, robot: str = "robot") -> Place:
         """Return where to connect to; `robot` is the name unless one is given.
 
         Raises:
-            UsageError: the name or the network cannot be.
+            UsageError: the name or the network cannot be, or the folder of keys is not this robot's.
         """
         name = self.robot or robot
         check_chunk("robot", name)
-        return Place(name, self.listen, tuple(self.connect or ()), network_named(self.network), self.seed)
+        known = load_credentials(self.secure, name, [COORDINATOR, OBSERVER]) if self.secure else None
+        network = network_named(self.network)
+        return Place(name, self.listen, tuple(self.connect or ()), network, self.seed, known)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, 
 from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed, WithReport
 from coordinator.identification.identify import identify
 from coordinator.identification.result import DynamicsPart, Result
-from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.recording.run_folder import REPORT, load_recording
 from coordinator.recording.session_file import SessionFileError
 from coordinator.report.plots import MissingPlots
@@ -64,7 +64,7 @@ def run(
     config = RunConfig(
         robot=place.robot,
         out=out,
-        sender=sender_name(),
+        sender=new_sender(),
         plan=settings.chosen(),
         expect=expect,
         resume=resume,

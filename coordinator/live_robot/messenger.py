@@ -5,6 +5,7 @@ Clock and event loop are arguments, so that the same code runs in real and in vi
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterable
+from typing import NamedTuple
 
 from coordinator.recording.recording import Entry
 from module_agent.model.errors import RobotError
@@ -21,6 +22,7 @@ from module_agent.transport.transport import (
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Message
+from module_agent.wire.proof import proven
 from module_agent.wire.refusal import WireError
 from module_agent.wire.topics import PUBLISHED_BY_MODULE
 
@@ -30,6 +32,13 @@ Clock = Callable[[], int]
 
 Post = Callable[[Callable[[], None]], object]
 Record = Callable[[Entry], Message | None]
+
+
+class Sender(NamedTuple):
+    """Who commands: a unique name, and the secret that proves that a command is of the lease's holder."""
+
+    name: str
+    secret: bytes = b""
 
 
 class NoAnswer(RobotError):
@@ -121,17 +130,19 @@ class Messenger:
         if future is not None and not future.done():
             future.set_result(reply)
 
-    def publish(self, serial: str, leaf: Leaf, message: Message) -> None:
-        """Publish on a module's key."""
-        self._transport.publish(key(self.robot, serial, leaf), encode(message))
+    def publish(self, serial: str, leaf: Leaf, message: Message, secret: bytes = b"") -> None:
+        """Publish on a module's key, with the proof of the secret of a lease."""
+        self._transport.publish(key(self.robot, serial, leaf), proven(encode(message), secret))
 
-    async def ask(self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Message:
-        """Ask a module and return its answer, which may be a refusal.
+    async def ask(
+        self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5, secret: bytes = b""
+    ) -> Message:
+        """Ask a module, with the proof of the secret of a lease; return its answer, which may be a refusal.
 
         Raises:
             NoAnswer: no answer within the time, or an unreadable one.
         """
-        topic, payload = key(self.robot, serial, leaf), encode(message)
+        topic, payload = key(self.robot, serial, leaf), proven(encode(message), secret)
         self._tag += 1
         tag = self._tag
         future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
@@ -149,14 +160,16 @@ class Messenger:
             raise NoAnswer(serial, leaf, "its answer could not be read")
         return answer
 
-    async def command(self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
-        """Send a command; return the module's acknowledgement.
+    async def command(
+        self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5, secret: bytes = b""
+    ) -> Ack:
+        """Send a command, see `ask`; return the module's acknowledgement.
 
         Raises:
             Refused: the module refused it.
             NoAnswer: see `ask`.
         """
-        answer = await self.ask(serial, leaf, message, timeout_s)
+        answer = await self.ask(serial, leaf, message, timeout_s, secret)
         if not isinstance(answer, Ack):
             raise NoAnswer(serial, leaf, f"its answer is {type(answer).__name__}, not Ack")
         if not answer.accepted:

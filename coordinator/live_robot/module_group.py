@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from coordinator.live_robot.backfill import RowCompletion
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, RobotStopped
-from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused, gather_all
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused, Sender, gather_all
 from coordinator.recording.recording import ModuleRecord, Recording
 from module_agent.control.waveform import duration_s
 from module_agent.model.catalogue import ModuleType, module_type
@@ -65,9 +65,9 @@ class _Started(NamedTuple):
 class ModuleGroup:
     """Commands to the modules of one robot under this sender's leases."""
 
-    def __init__(self, messenger: Messenger, recording: Recording, clock: Clock, sender: str):
+    def __init__(self, messenger: Messenger, recording: Recording, clock: Clock, sender: Sender):
         self.serials: tuple[str, ...] = ()
-        self.sender = sender
+        self.sender, self._secret = sender
         self._messenger = messenger
         self._recording = recording
         self._clock = clock
@@ -142,11 +142,17 @@ class ModuleGroup:
         return self._request(kind, serial, **head, **fields)
 
     def _lease(self, serial: str, action: str) -> LeaseRequest:
-        return self._command(LeaseRequest, serial, action=action, duration_ns=LEASE_NS)
+        # No other program hears an acquisition; renewals are proven like every other command.
+        secret = self._secret if action == "acquire" else b""
+        return self._command(LeaseRequest, serial, action=action, duration_ns=LEASE_NS, secret=secret)
+
+    async def _commanded(self, serial: str, leaf: Leaf, command: Message, timeout_s: float = 0.5) -> Ack:
+        """Send a command under the lease, with the proof that it is this sender's."""
+        return await self._messenger.command(serial, leaf, command, timeout_s, self._secret)
 
     async def _achieve(self, serial: str, leaf: Leaf, command: Callable[[], Message]) -> Ack:
         """Send commands, each made anew, until one is acknowledged."""
-        return await self._persist(serial, lambda: self._messenger.command(serial, leaf, command()))
+        return await self._persist(serial, lambda: self._commanded(serial, leaf, command()))
 
     async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
         """Try until answered; a network may lose requests and answers."""
@@ -260,7 +266,7 @@ class ModuleGroup:
     async def _renew(self, serial: str) -> None:
         sent_ns = self._clock()
         try:
-            await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
+            await self._commanded(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
         except NoAnswer:
             pass  # lost; the next one follows, and `check` notices missing feedback
         except Refused as refused:
@@ -276,7 +282,7 @@ class ModuleGroup:
             return
         # Lost or refused: the next renewal follows.
         with contextlib.suppress(NoAnswer, Refused):
-            await self._messenger.command(serial, Leaf.MOTION, self._motion(serial, running), timeout_s=0.3)
+            await self._commanded(serial, Leaf.MOTION, self._motion(serial, running), timeout_s=0.3)
 
     async def release_all(self) -> None:
         """Release all modules; their motors are off then."""
@@ -322,7 +328,7 @@ class ModuleGroup:
         # The set-point replaces the last motion, which must not be commanded again.
         self._running.pop(serial, None)
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
-        self._messenger.publish(serial, Leaf.SETPOINT, self._command(Setpoint, serial, **point))
+        self._messenger.publish(serial, Leaf.SETPOINT, self._command(Setpoint, serial, **point), self._secret)
 
     def _next_id(self) -> int:
         # Numbers grow from one coordinator to the next, so that none repeats.

@@ -37,7 +37,7 @@ from coordinator.identification.preview import Preview, Previewer
 from coordinator.identification.result import Result, write_result
 from coordinator.identification.topology_search import doubtful_motions
 from coordinator.live_robot.errors import ModuleLost
-from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Post, Refused
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Post, Refused, Sender
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.merge.calibration_file import each_once, read_calibration, write_calibration
 from coordinator.merge.information_file import RunInformation, write_information
@@ -91,7 +91,7 @@ class RunConfig(NamedTuple):
 
     robot: str
     out: Path
-    sender: str
+    sender: Sender
     plan: Plan = Plan()
     expect: int | None = None
     resume: bool = False
@@ -156,7 +156,9 @@ class Run:
             self._take_over(crashed)
         self._messenger = Messenger(transport, config.robot, clock, post, self._record)
         self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender)
-        self._requests = InformationRequests(self._messenger, self.recording, clock, config.sender, self.note)
+        self._requests = InformationRequests(
+            self._messenger, self.recording, clock, config.sender.name, self.note
+        )
 
     def _take_over(self, crashed: Path) -> None:
         try:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coordinator.live_robot.messenger import Clock, Messenger, Post, gather_all
+from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender, gather_all
 from coordinator.live_robot.module_group import POLL_S, ModuleGroup
 from coordinator.recording.recording import Recording
 from coordinator.torque_control.feed_forward import RATE_HZ, Reference, standing
@@ -100,7 +100,7 @@ class FollowSession:
         clock: Clock,
         post: Post,
         screen: FollowScreen,
-        sender: str,
+        sender: Sender,
     ):
         self._recording = Recording()
         self._messenger = Messenger(transport, name, clock, post, self._recording.accept)

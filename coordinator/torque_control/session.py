@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coordinator.live_robot.messenger import Clock, Messenger, Post, gather_all
+from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender, gather_all
 from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
 from coordinator.recording.recording import Recording
 from coordinator.torque_control.gains import compensation_gains, holding_gains
@@ -87,7 +87,7 @@ class CompensationSession:
         clock: Clock,
         post: Post,
         screen: CompensationScreen,
-        sender: str,
+        sender: Sender,
     ):
         self._recording = Recording()
         self._messenger = Messenger(transport, name, clock, post, self._recording.accept)

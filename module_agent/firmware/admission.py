@@ -1,15 +1,18 @@
 """Admission of commands: the checks run in one fixed order, and the first failure is the reason.
 
 Length, msgpack limits, version, types, finiteness, range (all in `codec`), then serial, boot, lease, sequence
-and age. Age is the time since the newest feedback that the sender had received, so late, replayed and thawed
-commands are refused without any clock in common.
+and age; with the lease the proof of its holder, if that has given a secret. Age is the time since the newest
+feedback that the sender had received, so late, replayed and thawed commands are refused without any clock in
+common.
 """
 
+import hmac
 from typing import Any
 
 from module_agent.wire.codec import decode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import GainsCommand, LeaseRequest, Message, MotionCommand, Setpoint
+from module_agent.wire.proof import is_proven
 from module_agent.wire.refusal import Refusal, WireError
 from module_agent.wire.topics import TOPICS
 
@@ -26,11 +29,12 @@ class Lease:
     Times are the module's own nanoseconds.
     """
 
-    __slots__ = ("_granted", "_until_ns", "holder", "token")
+    __slots__ = ("_granted", "_secret", "_until_ns", "holder", "token")
 
     def __init__(self) -> None:
         self.holder: str | None = None
         self.token = 0
+        self._secret = b""
         self._until_ns = 0
         self._granted: dict[str, tuple[int, int]] = {}
 
@@ -53,8 +57,13 @@ class Lease:
         it nor bring back a lease that was released.
 
         Raises:
-            WireError: HELD, naming the holder and the time left; SEQUENCE for a copy after release.
+            WireError: HELD, naming the holder and the time left; UNPROVEN, in the holder's name without its
+                secret; SEQUENCE for a copy after release.
         """
+        if self.holder == request.sender and not hmac.compare_digest(self._secret, request.secret):
+            raise WireError(
+                Refusal.UNPROVEN, f"{request.sender} holds the lease, and acquired it with another secret"
+            )
         granted = self._granted.get(request.sender)
         if granted is not None and request.seq <= granted[0]:
             if granted == (request.seq, self.token) and self.holder == request.sender:
@@ -65,7 +74,7 @@ class Lease:
         if self.holder not in (None, request.sender):
             left_s = self.left_ns(now_ns) / 1e9
             raise WireError(Refusal.HELD, f"held by {self.holder} for another {left_s:.2f} s")
-        self.holder = request.sender
+        self.holder, self._secret = request.sender, request.secret
         self.token += 1
         self._until_ns = now_ns + request.duration_ns
         self._granted.pop(request.sender, None)
@@ -80,14 +89,15 @@ class Lease:
 
     def release(self) -> None:
         """End the lease; the token stays, so that old commands stay refused."""
-        self.holder = None
+        self.holder, self._secret = None, b""
         self._until_ns = 0
 
-    def check(self, sender: str, token: int) -> None:
-        """Check that a command comes from the present holder under the present token.
+    def check(self, sender: str, token: int, payload: bytes) -> None:
+        """Check that a command, `payload` on the wire, comes from the present holder under the present token.
 
         Raises:
-            WireError: HELD, the lease has another holder; NO_LEASE, it has none or another token.
+            WireError: HELD, the lease has another holder; NO_LEASE, it has none or another token; UNPROVEN,
+                the command does not end with the proof of the holder's secret.
         """
         if self.holder is None:
             raise WireError(Refusal.NO_LEASE, f"{sender} holds no lease: acquire it first")
@@ -95,6 +105,10 @@ class Lease:
             raise WireError(Refusal.HELD, f"held by {self.holder}, not by {sender}")
         if token != self.token:
             raise WireError(Refusal.NO_LEASE, f"token {token} is not the lease's token {self.token}")
+        if self._secret and not is_proven(payload, self._secret):
+            raise WireError(
+                Refusal.UNPROVEN, f"it does not prove that it is from {sender}, which holds the lease"
+            )
 
 
 class Admission:
@@ -130,14 +144,14 @@ class Admission:
             )
         return message
 
-    def check_command(self, command: Command, lease: Lease, now_ns: int) -> None:
-        """Check lease, sequence and age of a command.
+    def check_command(self, command: Command, payload: bytes, lease: Lease, now_ns: int) -> None:
+        """Check lease, proof, sequence and age of a command that came as `payload`.
 
         Raises:
             WireError: with the reason.
         """
         if not (isinstance(command, LeaseRequest) and command.action == "acquire"):
-            lease.check(command.sender, command.token)
+            lease.check(command.sender, command.token, payload)
             self._check_sequence(command)
         self._check_age(command.echo_ns, now_ns)
 

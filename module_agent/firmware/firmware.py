@@ -252,7 +252,7 @@ class Firmware:
     def _dispatch(self, incoming: Incoming) -> bytes:
         message = self.admission.read(incoming.leaf, incoming.payload)
         if isinstance(message, LeaseRequest | MotionCommand | Setpoint | GainsCommand):
-            self.admission.check_command(message, self.lease, self._now_ns)
+            self.admission.check_command(message, incoming.payload, self.lease, self._now_ns)
         match message:
             case Ask() if incoming.leaf is Leaf.INFO:
                 return encode(self._info())

@@ -1,10 +1,15 @@
 """Endpoints of the network: the hub listens on one, the others connect to it."""
 
 import re
+from ipaddress import ip_address
 
 from module_agent.model.errors import UsageError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+OPEN_TO_ALL = (
+    "every program that reaches that address can hear, deceive and move the robot; "
+    "use --secure, see docs/security.md"
+)
 _WITH_PORT = ("tcp", "tls", "quic", "udp", "ws")
 _OTHERS = ("serial", "unixpipe", "unixsock-stream", "vsock")
 _FORM = re.compile(r"(?P<protocol>[a-z-]+)/(?P<address>[^?#]+)([?#].*)?\Z")
@@ -33,3 +38,17 @@ def check_endpoint(text: str) -> str:
             f"endpoint {text!r}: an address of {protocol} is HOST:PORT, with a port of 1 to 65535"
         )
     return text
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Return whether an endpoint that `check_endpoint` takes is reached from this machine only."""
+    match = _FORM.match(endpoint)
+    if match is None or match["protocol"] in _OTHERS:
+        return match is not None
+    host = match["address"].rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False

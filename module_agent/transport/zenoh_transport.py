@@ -23,6 +23,7 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
 from module_agent.model.errors import UsageError
+from module_agent.transport.credentials import Credentials, secured
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from module_agent.transport.handles import Answer, Declaration, Question
 from module_agent.transport.transport import (
@@ -45,7 +46,8 @@ _MAX_MESSAGE_BYTES = 1 << 20
 class ZenohConfig(BaseModel):
     """How a session meets the others; endpoints are Zenoh's, such as `tcp/127.0.0.1:7447`.
 
-    `connect_timeout_s` bounds how long a `client` waits for its hub while it opens (None = for ever).
+    `connect_timeout_s` bounds how long a `client` waits for its hub while it opens (None = for ever). With
+    `credentials` all links are mutual TLS, and a hub allows by them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -54,11 +56,12 @@ class ZenohConfig(BaseModel):
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     connect_timeout_s: float | None = Field(default=None, gt=0.0)
+    credentials: Credentials | None = None
 
     @classmethod
-    def hub(cls, endpoint: str = DEFAULT_ENDPOINT) -> Self:
+    def hub(cls, endpoint: str = DEFAULT_ENDPOINT, credentials: Credentials | None = None) -> Self:
         """Return the configuration of the one session that all others connect to."""
-        return cls(listen=(endpoint,))
+        return cls(listen=(endpoint,), credentials=credentials)
 
     @classmethod
     def spoke(cls, endpoint: str = DEFAULT_ENDPOINT) -> Self:
@@ -131,6 +134,8 @@ class ZenohTransport:
                 key,
                 zenoh.handlers.Callback(partial(_finish, question), lambda: question.finish(None, NO_ANSWER)),
                 payload=payload,
+                # By default a queryable that calls itself complete is asked in place of the module's own.
+                target=zenoh.QueryTarget.ALL,
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -253,12 +258,30 @@ def open_zenoh(config: ZenohConfig) -> ZenohTransport:
     try:
         for endpoint in (*config.listen, *config.connect):
             check_endpoint(endpoint)
+        config = _secure(config)
     except UsageError as error:
         raise TransportError(str(error)) from error
     try:
         return ZenohTransport(zenoh.open(_session_config(config)))
     except zenoh.ZError as error:
         raise _why_not_open(config, error) from error
+
+
+def _secure(config: ZenohConfig) -> ZenohConfig:
+    """Return the configuration with endpoints of TLS, if it has credentials.
+
+    Raises:
+        UsageError: they do not allow to listen, or an endpoint is of another protocol.
+    """
+    credentials = config.credentials
+    if credentials is None:
+        return config
+    if config.listen and not credentials.may_serve:
+        raise UsageError(
+            f"the certificate of {credentials.name} is good for connecting only: the coordinator is the hub"
+        )
+    listen, connect = (tuple(map(secured, ends)) for ends in (config.listen, config.connect))
+    return config.model_copy(update={"listen": listen, "connect": connect})
 
 
 def _session_config(config: ZenohConfig) -> zenoh.Config:
@@ -284,6 +307,8 @@ def _session_config(config: ZenohConfig) -> zenoh.Config:
         # Zenoh's default is 1 GiB; the largest message here has 80 KiB.
         "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
     }
+    if config.credentials is not None:
+        settings |= config.credentials.settings(as_hub=bool(config.listen))
     made = zenoh.Config()
     for name, value in settings.items():
         made.insert_json5(name, json.dumps(value))
@@ -300,7 +325,8 @@ def _why_not_open(config: ZenohConfig, error: zenoh.ZError) -> TransportError:
     if config.mode == "client" and "Unable to connect" in text:
         return NoHub(
             f"no hub answers on {', '.join(config.connect)} within {config.connect_timeout_s} s; is the "
-            "coordinator running, and do both sides agree on address, TLS and password?"
+            "coordinator running, do both sides agree on the address, and do both (or neither) use --secure "
+            "with certificates of the same authority?"
         )
     return TransportError(
         f"cannot open a Zenoh session (listen {list(config.listen)}, connect {list(config.connect)}): {text}"

@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 import msgpack
 from pydantic import ValidationError
 
-from module_agent.wire.messages import SCHEMA_VERSION, Message
+from module_agent.wire.messages import COMMANDS, SCHEMA_VERSION, Message
+from module_agent.wire.proof import is_proof
 from module_agent.wire.refusal import Refusal, WireError
 
 MAX_COMMAND_BYTES = 4096
@@ -40,7 +41,7 @@ def _is_nested_deeper(value: dict[str, Any] | tuple[Any, ...], levels: int) -> b
     )
 
 
-def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
+def _unpack(data: bytes, max_bytes: int, may_prove: bool) -> dict[str, Any]:
     if len(data) > max_bytes:
         raise WireError(Refusal.TOO_LONG, f"{len(data)} bytes, at most {max_bytes} are read")
     try:
@@ -55,6 +56,10 @@ def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
             max_map_len=64,
             max_ext_len=0,
         )
+    except msgpack.ExtraData as more:
+        if not (may_prove and is_proof(more.extra)):
+            raise WireError(Refusal.MALFORMED, f"{len(more.extra)} bytes follow the map") from more
+        value = more.unpacked
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError(Refusal.MALFORMED, f"not a msgpack map: {error or type(error).__name__}") from error
     if not isinstance(value, dict):
@@ -76,13 +81,13 @@ def _reason(error: ValidationError) -> WireError:
 
 
 def decode(kind: type[M], data: bytes, max_bytes: int = MAX_COMMAND_BYTES) -> M:
-    """Return the message of type `kind` that `data` holds.
+    """Return the message of type `kind` that `data` holds; a proof may follow a command, and is not checked.
 
     Raises:
         WireError: the bytes are too long, malformed, of another schema version, or hold a field of the wrong
             type, a value that is not finite, or one out of range; the reason says which.
     """
-    value = _unpack(data, max_bytes)
+    value = _unpack(data, max_bytes, issubclass(kind, COMMANDS))
     version = value.get("v")
     if version != SCHEMA_VERSION:
         who = value.get("serial") or value.get("sender") or "the sender"

@@ -340,13 +340,17 @@ class HistoryRequest(Message):
 
 
 class LeaseRequest(Message):
-    """Acquire (which arms), renew (the keep-alive of a motion) or release the command of a joint."""
+    """Acquire (which arms), renew (the keep-alive of a motion) or release the command of a joint.
+
+    A sender that acquires with a `secret` must end every later command with its proof (see `proof`).
+    """
 
     sender: Name
     action: Literal["acquire", "renew", "release"]
     token: Counter
     echo_ns: Nanoseconds
     duration_ns: Annotated[int, Field(gt=0, le=10_000_000_000)] = 1_000_000_000
+    secret: Annotated[bytes, Field(max_length=32)] = b""
 
 
 class MotionCommand(Message):
@@ -388,3 +392,7 @@ class GainsCommand(Message):
     token: Counter
     echo_ns: Nanoseconds
     gains: GainSet
+
+
+# What the holder of a lease sends: checked for lease, proof, sequence and age.
+COMMANDS = (LeaseRequest, MotionCommand, Setpoint, GainsCommand)

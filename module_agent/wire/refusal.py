@@ -18,6 +18,7 @@ class Refusal(StrEnum):
     WRONG_BOOT = "wrong_boot"
     HELD = "held"
     NO_LEASE = "no_lease"
+    UNPROVEN = "unproven"
     SEQUENCE = "sequence"
     STALE = "stale"
     NOT_ARMED = "not_armed"

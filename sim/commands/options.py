@@ -88,6 +88,10 @@ class LaunchOptions:
         int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
     ] = None
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = DEFAULT_ENDPOINT
+    secure: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Speak mutual TLS, keys in this folder; makes what is missing."),
+    ] = None
     report: WithReport = True
 
     def check(self) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from coordinator.commands.options import PlanOptions, Quiet
+from coordinator.live_robot.authority import make_credentials
 from coordinator.recording.run_folder import REPORT
 from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
@@ -108,7 +109,10 @@ def _launch(
         # The robot ends with this run, so that there is nothing to resume.
         coordinator_options=("--no-advise", *reported, *coordinator_options, *motions.arguments()),
         out=launched.new_folder(robot),
+        secure=launched.secure,
     )
+    if config.secure is not None:
+        make_credentials(config.secure, robot.name, robot.serials, [s for s in config.shares if len(s) > 1])
     _run_processes(config)
     add_truth(config.out, viewer, _note)
     score_run(config.out)

@@ -35,7 +35,7 @@ class LaunchConfig(NamedTuple):
 
     `pushes` are on the world, as its option `--push` takes them.
     `within` maps the name of a process ("world", "coordinator", or "agent" and its serials) to the command
-    that it is run by, such as `nsenter` with a network namespace.
+    that it is run by, such as `nsenter` with a network namespace. `secure` is a folder of keys.
     """
 
     robot_file: str
@@ -54,6 +54,18 @@ class LaunchConfig(NamedTuple):
     pushes: tuple[str, ...] = ()
     imu_rate_hz: float = 250.0
     physics: Physics = "pybullet"
+    secure: Path | None = None
+
+    @property
+    def shares(self) -> list[tuple[str, ...]]:
+        """The serials of each agent process."""
+        count = min(self.processes or len(self.serials), len(self.serials))
+        return [self.serials[i::count] for i in range(count)]
+
+    @property
+    def secured(self) -> list[str]:
+        """What agents and coordinator are told of security."""
+        return [] if self.secure is None else ["--secure", str(self.secure)]
 
 
 class Child(NamedTuple):
@@ -110,17 +122,14 @@ class Launcher:
 
     def start_agents(self) -> list[Child]:
         """Start the agent processes; they wait for the coordinator by themselves."""
-        config = self.config
-        count = config.processes or len(config.serials)
-        shares = [config.serials[i::count] for i in range(min(count, len(config.serials)))]
-        return [self.start_agent(share, index) for index, share in enumerate(shares)]
+        return [self.start_agent(share, index) for index, share in enumerate(self.config.shares)]
 
     def start_agent(self, serials: Sequence[str], index: int = 0) -> Child:
         """Start one agent process that hosts these modules."""
         config = self.config
         arguments = ["module_agent.main", "--bus", self.bus, "--robot", config.robot_name]
         arguments += ["--connect", config.endpoint, "--network", config.network]
-        arguments += ["--seed", str(1000 * config.seed + index + 1), *config.agent_options]
+        arguments += ["--seed", str(1000 * config.seed + index + 1), *config.secured, *config.agent_options]
         for serial in serials:
             arguments += ["--serial", serial]
         agent = self._start(f"agent {','.join(serials)}", arguments, up=ATTACHED)
@@ -133,7 +142,8 @@ class Launcher:
         arguments = ["coordinator.main", "run", "--out", str(config.out), "--robot", config.robot_name]
         arguments += ["--listen", config.endpoint, "--network", config.network]
         arguments += ["--seed", str(1000 * config.seed), "--expect", str(len(config.serials))]
-        arguments += ["--speed", str(config.speed), *config.coordinator_options, *options]
+        arguments += ["--speed", str(config.speed), *config.secured]
+        arguments += [*config.coordinator_options, *options]
         return self._start("coordinator", arguments, quiet)
 
     def _log(self, name: str) -> Path:

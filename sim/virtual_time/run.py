@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
+from coordinator.live_robot.messenger import Sender
 from coordinator.runtime.event_loop import Interruption
 from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
@@ -20,6 +21,7 @@ from sim.world.external_force import Push
 from sim.world.truth import write_truth
 
 COORDINATOR = "coordinator"
+SENDER = Sender(COORDINATOR, b"virtual-secret-1")
 
 
 class VirtualConfig(NamedTuple):
@@ -81,7 +83,7 @@ def run_virtual(
             RunConfig(
                 robot=config.robot.name,
                 out=config.out,
-                sender=COORDINATOR,
+                sender=SENDER,
                 plan=config.plan,
                 expect=len(robot.world.modules),
                 inline=True,

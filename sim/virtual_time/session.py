@@ -20,7 +20,7 @@ from coordinator.session.session import Session
 from coordinator.topology.next_motion import NextMotion
 from module_agent.model.catalogue import module_type
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings, virtual_robot
-from sim.virtual_time.run import COORDINATOR, SilentScreen
+from sim.virtual_time.run import COORDINATOR, SENDER, SilentScreen
 
 
 def record_session(
@@ -46,7 +46,7 @@ def record_session(
         recorder = _MemoryRecorder(plan, recording, lambda: loop.now_ns, on_explored)
         endpoint = robot.endpoint(COORDINATOR)
         messenger = Messenger(endpoint, name, lambda: loop.now_ns, loop.call_soon, recording.accept)
-        group = ModuleGroup(messenger, recording, lambda: loop.now_ns, COORDINATOR)
+        group = ModuleGroup(messenger, recording, lambda: loop.now_ns, SENDER)
         session = Session(group, messenger, recording, plan, lambda: loop.now_ns, recorder.journal, recorder)
 
         async def whole_session() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.errors import RobotStopped
+from coordinator.live_robot.messenger import Sender
 from coordinator.torque_control.follow_session import FollowPlan, FollowSession, TrackingLost
 from coordinator.torque_control.gravity_compensation import StaleFeedback
 from coordinator.torque_control.gravity_model import GravityModel, gravity_model
@@ -52,7 +53,7 @@ def session(
         lambda: loop.now_ns,
         loop.call_soon,
         notes,
-        "follow",
+        Sender("follow"),
     )
     return made, notes
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coordinator.live_robot.errors import RobotStopped
-from coordinator.live_robot.messenger import Refused
+from coordinator.live_robot.messenger import Refused, Sender
 from coordinator.torque_control.gravity_compensation import (
     CompensationRefused,
     CompensationSettings,
@@ -247,7 +247,7 @@ class Seen:
 def session(rig: Any, plan: CompensationPlan = LONG) -> tuple[CompensationSession, Seen]:
     seen, loop = Seen(), rig.loop
     made = CompensationSession(
-        rig.endpoint("float"), ARM, weight(), plan, lambda: loop.now_ns, loop.call_soon, seen, "float"
+        rig.endpoint("float"), ARM, weight(), plan, lambda: loop.now_ns, loop.call_soon, seen, Sender("float")
     )
     return made, seen
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify
+from coordinator.live_robot.messenger import Sender
 from coordinator.torque_control.gravity_model import GravityModel, gravity_model_of_result
 from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
 from coordinator.torque_control.summary import CompensationSummary
@@ -187,7 +188,7 @@ def compensate_robot(
         observer, loop = _TruthAtSetPoints(virtual), virtual.loop
         endpoint, name = virtual.endpoint(COORDINATOR), robot.name
         session = CompensationSession(
-            endpoint, name, weight, plan, lambda: loop.now_ns, loop.call_soon, observer, COORDINATOR
+            endpoint, name, weight, plan, lambda: loop.now_ns, loop.call_soon, observer, Sender(COORDINATOR)
         )
         summary = virtual.complete(session.run())
     phases, t_s, q_rad = zip(*observer.rows, strict=True)

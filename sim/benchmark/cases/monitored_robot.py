@@ -12,7 +12,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.live_robot.errors import MotionInterrupted
-from coordinator.live_robot.messenger import Messenger, gather_all
+from coordinator.live_robot.messenger import Messenger, Sender, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
@@ -76,7 +76,7 @@ def monitor_robot(
         listener = Messenger(
             robot.endpoint(MONITOR), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
         )
-        group = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
+        group = ModuleGroup(mover, recording, lambda: loop.now_ns, Sender(MOVER))
         for one in events:
             loop.schedule_ns(round(one.at_s * 1e9), lambda one=one: one.what(robot.world))  # type: ignore[misc]
 

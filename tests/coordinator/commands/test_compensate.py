@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from coordinator.commands.compensate_view import (
+from coordinator.commands.views.compensation import (
     CompensationView,
     moment_line,
     moment_table,

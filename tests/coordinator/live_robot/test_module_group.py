@@ -272,8 +272,8 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
     messenger, recording, group = rig.group()
     lost: list[Ack] = []
 
-    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
-        ack = await Messenger.command(messenger, serial, leaf, message, timeout_s)
+    async def command(serial: str, leaf: Leaf, message: Message, *how: Any) -> Ack:
+        ack = await Messenger.command(messenger, serial, leaf, message, *how)
         if leaf is Leaf.MOTION and not lost:
             lost.append(ack)
             # The answer is lost, and for longer than a command lives so are the keep-alives.
@@ -361,10 +361,10 @@ def _commands(monkeypatch: pytest.MonkeyPatch, messenger: Messenger) -> list[Mot
     """Return a list that fills with the motion commands that go out."""
     sent: list[MotionCommand] = []
 
-    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+    async def command(serial: str, leaf: Leaf, message: Message, *how: Any) -> Ack:
         if isinstance(message, MotionCommand):
             sent.append(message)
-        return await Messenger.command(messenger, serial, leaf, message, timeout_s)
+        return await Messenger.command(messenger, serial, leaf, message, *how)
 
     monkeypatch.setattr(messenger, "command", command)
     return sent
@@ -462,10 +462,10 @@ def test_a_motion_during_which_another_joint_expires_is_interrupted(
     rig = rigs(ARM, "lan")
     messenger, _, group = rig.group()
 
-    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+    async def command(serial: str, leaf: Leaf, message: Message, *how: Any) -> Ack:
         if serial == TIP and leaf is Leaf.LEASE and rig.state(BASE) == "moving":
             raise NoAnswer(serial, leaf, "Timeout")
-        return await Messenger.command(messenger, serial, leaf, message, timeout_s)
+        return await Messenger.command(messenger, serial, leaf, message, *how)
 
     monkeypatch.setattr(messenger, "command", command)
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from coordinator.identification.preview import Previewer
+from coordinator.live_robot.messenger import Sender
 from coordinator.session.run import Run, RunConfig
 from module_agent.transport.transport import Transport
 
@@ -33,7 +34,7 @@ class Slow:
 def run_of(tmp_path: Path, previewer: Any, shown: list[Any], inline: bool = False) -> Run:
     transport: Transport = SimpleNamespace()  # type: ignore[assignment]
     screen = SimpleNamespace(step=lambda *_: None, note=lambda *_: None)
-    config = RunConfig(robot="arm", out=tmp_path / "run", sender="me", inline=inline)
+    config = RunConfig(robot="arm", out=tmp_path / "run", sender=Sender("me"), inline=inline)
     run = Run(config, transport, lambda: 0, lambda work: None, screen)  # type: ignore[arg-type]
     run._previewer = previewer
     run._feed = SimpleNamespace(  # type: ignore[assignment]

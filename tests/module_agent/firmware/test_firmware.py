@@ -39,6 +39,7 @@ from module_agent.wire.messages import (
     Stop,
     WindowedSine,
 )
+from module_agent.wire.proof import proven
 from module_agent.wire.refusal import Refusal
 from tests.module_agent.wired_firmware import WiredFirmware
 
@@ -709,3 +710,57 @@ def test_a_holder_cannot_command_what_no_module_should_do() -> None:
         assert refused(answer, Refusal.LIMIT)
         assert field in answer.detail
     assert bench.firmware.state == "armed"
+
+
+def proven_ask(bench: Bench, leaf: Leaf, message: Message, secret: bytes) -> Ack:
+    return bench.ask(leaf, proven(encode(message), secret))
+
+
+def test_of_a_lease_with_a_secret_only_proven_commands_are_taken() -> None:
+    """Holder, token, boot, sequence and time are all published: they do not make a commander."""
+    bench = Bench()
+    assert bench.acquire(secret=b"secret").accepted
+    aims = {"position_rad": 0.3, "velocity_rad_s": None, "effort_nm": None}
+    commands: list[tuple[Leaf, type[Message], dict[str, Any]]] = [
+        (Leaf.SETPOINT, Setpoint, aims),
+        (Leaf.GAINS, GainsCommand, {"gains": bench.gains}),
+        (Leaf.LEASE, LeaseRequest, {"action": "renew"}),
+        (Leaf.MOTION, MotionCommand, {"motion_id": 1, "pattern": Rest(duration_s=1.0)}),
+        (Leaf.LEASE, LeaseRequest, {"action": "release"}),
+    ]
+    for leaf, kind, fields in commands:
+        for secret in (b"", b"guess"):
+            forged = kind(**bench.head(**fields, seq=10**6))
+            assert refused(proven_ask(bench, leaf, forged, secret), Refusal.UNPROVEN)
+    assert bench.firmware.state == "armed"
+    for leaf, kind, fields in commands:
+        # The forged sequence numbers, far ahead, have not made the holder's own too small.
+        assert proven_ask(bench, leaf, kind(**bench.head(**fields)), b"secret").accepted
+    assert bench.firmware.state == "idle"
+
+
+def test_a_changed_byte_of_a_proven_command_is_refused() -> None:
+    bench = Bench()
+    bench.acquire(secret=b"secret")
+    aims = {"position_rad": 0.3, "velocity_rad_s": None, "effort_nm": None}
+    payload = proven(encode(Setpoint(**bench.head(**aims))), b"secret")
+    for place in range(len(payload)):
+        changed = payload[:place] + bytes([payload[place] ^ 1]) + payload[place + 1 :]
+        assert not bench.ask(Leaf.SETPOINT, changed).accepted
+    assert bench.ask(Leaf.SETPOINT, payload).accepted
+
+
+def test_nobody_acquires_in_the_holders_name_without_its_secret() -> None:
+    bench = Bench()
+    bench.acquire(secret=b"secret")
+    for secret in (b"", b"guess"):
+        assert refused(bench.acquire(secret=secret), Refusal.UNPROVEN)
+    assert bench.acquire(secret=b"secret").accepted
+
+
+def test_the_secret_ends_with_the_lease() -> None:
+    bench = Bench()
+    bench.acquire(secret=b"secret", duration_ns=300 * MS)
+    bench.ticks(310)
+    assert bench.acquire(sender="other").accepted
+    assert bench.setpoint(sender="other").accepted

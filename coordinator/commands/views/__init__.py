@@ -1,0 +1,1 @@
+"""What commands show: live screens, and tables of results."""
