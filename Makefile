@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS := 1
 .PHONY: help demo kinematics dynamics thesis test coverage check bench clean
 
 help:
-	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
+	@echo "make demo    a simulated arm identifies itself over Zenoh in processes of its own, and is scored"
 	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
 	@echo "make dynamics    inertia, payloads, torque control and monitoring, every row in about a minute"
 	@echo "make thesis  the thesis' experiments side by side with what was printed, few trials, under three minutes"

@@ -85,7 +85,10 @@ class LaunchOptions:
         str | None, typer.Option(help=f"Network: {', '.join(PROFILES)}, or a TOML file [the robot's].")
     ] = None
     processes: Annotated[
-        int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
+        int | None,
+        typer.Option(
+            min=1, help="Agent processes that share the modules [one a core, or one for each 8 modules]."
+        ),
     ] = None
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = DEFAULT_ENDPOINT
     secure: Annotated[

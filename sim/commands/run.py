@@ -19,7 +19,7 @@ from coordinator.viewer.targets import NATIVE_PORT, proxy_url, viewer_choice
 from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
 from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import score_run
-from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError
+from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError, default_processes
 from sim.robot.robot_file import RobotFileError
 from sim.scoring.truth_recording import add_truth
 from sim.virtual_time.run import VirtualConfig, run_virtual
@@ -101,7 +101,7 @@ def _launch(
         noise=settings.choice(),
         speed=settings.speed,
         endpoint=launched.endpoint,
-        processes=launched.processes,
+        processes=launched.processes or default_processes(len(robot.serials)),
         pushes=tuple(settings.push or ()),
         imu_rate_hz=settings.imu_rate_hz,
         physics=settings.physics or "pybullet",

@@ -23,11 +23,19 @@ WATCH_S = 0.1
 LOGS = "logs"
 # The file systems' limit is 255 bytes.
 _MAX_NAME = 100
+# A process is woken once a tick whatever it hosts: eight modules in one cost a sixth of eight processes.
+MODULES_PER_PROCESS = 8
 _PR_SET_PDEATHSIG = 1
 
 
 class LaunchError(RobotError):
     """A process did not start or ended early; the message has its name and its last output."""
+
+
+def default_processes(modules: int, cores: int | None = None) -> int:
+    """Return how many agent processes share the modules: one a core, more if it would host over eight."""
+    cores = cores or os.cpu_count() or 1
+    return min(modules, max(cores, -(-modules // MODULES_PER_PROCESS)))
 
 
 class LaunchConfig(NamedTuple):

@@ -3,8 +3,11 @@
 An agent is in the barrier while it answers every tick within the bound. One that does not (frozen, or just
 starting) is excluded: its motors get zero PWM, and it receives no samples until it answers the frame that it
 owes. That answer is late and so discarded, and the agent is back in the barrier with the next samples: a
-thawed agent finds no backlog. Measured on 2 cores, one process per module, trivial world: 60 us a tick for 4
-agents, 120 us for 7, 270 us for 16.
+thawed agent finds no backlog. A connection without a hello within `HELLO_S` is dropped, and an agent that has
+not answered for `ABANDONED_S` loses its modules to the next one that asks for them. An agent that answers,
+but keeps the world waiting, is named, once.
+Measured on 2 cores, one process per module, trivial world: 60 us a tick for 4 agents, 120 us for 7, 270 us
+for 16.
 """
 
 import os
@@ -30,6 +33,14 @@ from module_agent.model.errors import UsageError
 
 _BACKLOG = 128
 _MAX_LAG_S = 0.020
+# A hello is sent at once; the rest is the patience of a busy machine.
+HELLO_S = 2.0
+# An agent may be frozen for a while and come back; it keeps its modules for this long.
+ABANDONED_S = 10.0
+# An agent is slow if the world waits this long for it in a tenth of its ticks.
+SLOW_S = 0.005
+SLOW_TICKS = 100
+_WINDOW_TICKS = 10 * SLOW_TICKS
 
 
 class World(Protocol):
@@ -64,6 +75,10 @@ class _Agent:
 
     def __init__(self, connection: socket.socket):
         self.connection = connection
+        # When it connected, said its hello, or was excluded.
+        self.silent_since_s = time.monotonic()
+        self.late_ticks = 0
+        self.named = False
         self.serials: tuple[str, ...] = ()
         self.slots: tuple[int, ...] = ()
         self.frames = TickFrames.of(0)
@@ -108,6 +123,7 @@ class BusServer:
         self._poll = select.poll()
         self._listener = _listen(path)
         self._poll.register(self._listener, select.POLLIN)
+        self._before_hello: set[int] = set()
 
     @property
     def ticks(self) -> int:
@@ -125,8 +141,13 @@ class BusServer:
         self._collect()
         for descriptor, _ in self._poll.poll(0):
             self._attend(descriptor)
+        if self._before_hello:
+            self._drop_squatters()
         samples = self._world.step(tuple(self._pwm))
         self._tick += 1
+        if self._tick % _WINDOW_TICKS == 0:
+            for agent in self._inside.values():
+                agent.late_ticks = 0
         for agent in list(self._inside.values()):
             agent.owes_tick = self._tick
             self._send(agent, agent.frames.pack_samples(self._tick, [samples[slot] for slot in agent.slots]))
@@ -182,22 +203,27 @@ class BusServer:
     # ------------------------------------------------------------------- inside the barrier
 
     def _collect(self) -> None:
-        deadline_s = time.monotonic() + self._bound_s
+        before_s = time.monotonic()
+        deadline_s = before_s + self._bound_s
         for agent in list(self._inside.values()):
-            frame = self._receive(agent, deadline_s)
+            # Only after a straggler the others do not get the full bound again.
+            frame = self._receive(agent, before_s < deadline_s)
+            # Agents are read in turn: one that is not slower than those before it has answered already.
+            now_s = time.monotonic()
+            if now_s - before_s > SLOW_S:
+                self._count_late(agent)
+            before_s = now_s
             if frame is None:
                 self._exclude(agent)
             else:
                 self._apply(agent, frame)
 
-    def _receive(self, agent: _Agent, deadline_s: float) -> bytes | None:
+    def _receive(self, agent: _Agent, wait: bool) -> bytes | None:
         """Return the next frame, b"" when the agent is gone, None when the barrier's time is up."""
         size = agent.frames.pwm.size + 1
-        # The socket's own receive time-out is the bound: one system call, whether or not it has to wait. Only
-        # after a straggler the others do not get the full bound again.
-        flags = 0 if time.monotonic() < deadline_s else socket.MSG_DONTWAIT
+        # The socket's own receive time-out is the bound: one system call, whether or not it has to wait.
         try:
-            return agent.connection.recv(size, flags)
+            return agent.connection.recv(size, 0 if wait else socket.MSG_DONTWAIT)
         except BlockingIOError:
             return None
         except ConnectionError:
@@ -220,10 +246,20 @@ class BusServer:
     def _exclude(self, agent: _Agent) -> None:
         self._report(f"{agent.name} does not answer within {self._bound_s} s: zero PWM until it does")
         self._release(agent)
+        agent.silent_since_s = time.monotonic()
         descriptor = agent.connection.fileno()
         del self._inside[descriptor]
         self._outside[descriptor] = agent
         self._poll.register(descriptor, select.POLLIN)
+
+    def _count_late(self, agent: _Agent) -> None:
+        agent.late_ticks += 1
+        if agent.late_ticks == SLOW_TICKS and not agent.named:
+            agent.named = True
+            self._report(
+                f"{agent.name} is slow: the world waited over {1e3 * SLOW_S:.0f} ms for it {SLOW_TICKS} times"
+                f" within {_WINDOW_TICKS} ticks; give its process fewer modules, or the machine less to do"
+            )
 
     # ------------------------------------------------------------------- outside the barrier
 
@@ -233,6 +269,7 @@ class BusServer:
             connection, _ = self._listener.accept()
             _set_receive_timeout(connection, self._bound_s)
             self._outside[connection.fileno()] = _Agent(connection)
+            self._before_hello.add(connection.fileno())
             self._poll.register(connection, select.POLLIN)
             return
         agent = self._outside.get(descriptor)
@@ -252,6 +289,13 @@ class BusServer:
             self._readmit(agent, frame)
         else:
             self._welcome(agent, frame)
+
+    def _drop_squatters(self) -> None:
+        now_s = time.monotonic()
+        for descriptor in list(self._before_hello):
+            agent = self._outside[descriptor]
+            if now_s - agent.silent_since_s > HELLO_S:
+                self._drop(agent, f"is dropped: no hello within {HELLO_S:g} s")
 
     def _readmit(self, agent: _Agent, frame: bytes) -> None:
         try:
@@ -274,6 +318,8 @@ class BusServer:
             if self._send(agent, pack_refusal(str(error))):
                 self._drop(agent, f"is refused: {error}")
             return
+        self._before_hello.discard(agent.connection.fileno())
+        agent.silent_since_s = time.monotonic()
         agent.serials = serials
         agent.slots = tuple(self._slot_of[serial] for serial in serials)
         agent.frames = TickFrames.of(len(serials))
@@ -290,9 +336,16 @@ class BusServer:
                 if serial not in holder.serials:
                     continue
                 # An agent that died and is started again may be faster than the news of its death.
-                if not holder.hung_up():
+                if holder.hung_up():
+                    self._drop(holder, "is gone")
+                elif self._abandoned(holder):
+                    self._drop(holder, f"is dropped for another agent: no answer for {ABANDONED_S:g} s")
+                else:
                     raise FrameError(f"module {serial!r} has an agent already")
-                self._drop(holder, "is gone")
+
+    def _abandoned(self, agent: _Agent) -> bool:
+        outside = agent.connection.fileno() in self._outside
+        return outside and time.monotonic() - agent.silent_since_s > ABANDONED_S
 
     # ------------------------------------------------------------------- ends
 
@@ -312,6 +365,7 @@ class BusServer:
         self._report(f"{agent.name} {why}")
         self._release(agent)
         descriptor = agent.connection.fileno()
+        self._before_hello.discard(descriptor)
         if self._inside.pop(descriptor, None) is None:
             del self._outside[descriptor]
             self._poll.unregister(descriptor)

@@ -28,6 +28,7 @@ from module_agent.hardware.bus_frames import (
 )
 from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
 from module_agent.model.errors import UsageError
+from sim.world import bus_server
 from sim.world.bus_server import BusInUse, BusServer
 
 ROOT = Path(__file__).parents[3]
@@ -301,6 +302,48 @@ def test_garbage_on_the_socket_does_not_disturb_the_world(path) -> None:
         client = BusClient(path, ["A"], LIMIT_S)
         assert len(client.exchange([0.0])) == 1
         client.close()
+
+
+def test_a_connection_that_says_nothing_is_dropped_and_holds_nobody_up(path, monkeypatch) -> None:
+    monkeypatch.setattr(bus_server, "HELLO_S", 0.05)
+    lines: list[str] = []
+    with (
+        BusServer(path, EchoWorld(["A"]), report=lines.append) as server,
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as squatter,
+    ):
+        squatter.connect(path)
+        tick_until(server, lambda: bool(lines))
+        squatter.settimeout(LIMIT_S)
+        assert squatter.recv(1) == b""
+    assert lines == ["an agent before its hello is dropped: no hello within 0.05 s"]
+
+
+def test_modules_of_an_agent_that_does_not_answer_go_to_the_next_that_asks(path, monkeypatch) -> None:
+    monkeypatch.setattr(bus_server, "ABANDONED_S", 0.3)
+    lines: list[str] = []
+    with running(BusServer(path, EchoWorld(["A"]), report=lines.append)):
+        squatter = BusClient(path, ["A"], LIMIT_S)
+        with pytest.raises(BusRefused, match="'A' has an agent already"):
+            BusClient(path, ["A"], LIMIT_S)
+        time.sleep(0.4)
+        successor = BusClient(path, ["A"], LIMIT_S)
+        assert len(successor.exchange([0.0])) == 1
+        with pytest.raises(HardwareLost):
+            exchange_often(squatter, 0.0)
+        successor.close()
+    assert "A is dropped for another agent: no answer for 0.3 s" in lines
+
+
+def test_the_slow_agent_is_named_once_and_the_others_are_not(path, start) -> None:
+    lines: list[str] = []
+    with running(BusServer(path, EchoWorld(["A", "B"]), bound_s=2.0, report=lines.append)):
+        start("B")
+        slow = BusClient(path, ["A"], LIMIT_S)
+        for _ in range(2 * bus_server.SLOW_TICKS + 10):
+            time.sleep(2.0 * bus_server.SLOW_S)
+            slow.exchange([0.0])
+        slow.close()
+    assert [line.split(":")[0] for line in lines if "slow" in line] == ["A is slow"]
 
 
 # ------------------------------------------------------------------------------- the socket file
