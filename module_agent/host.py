@@ -11,7 +11,9 @@ from module_agent.control.controller import Command
 from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, acknowledgement
-from module_agent.hardware.hardware import Modules, ModuleSample
+from module_agent.firmware.quiet_ticks import NOT_QUIET, ROW_DUE, QuietTicks
+from module_agent.hardware.hardware import Modules, ModuleSample, Readings
+from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
@@ -89,11 +91,12 @@ class HostedModule:
         """Return the inbox of a leaf."""
         return self.stops.put if leaf is Leaf.STOP else self.inbox.put
 
-    def collect(self) -> None:
-        """Take what has arrived by now; its age is judged by the time of the next sample."""
+    def collect(self) -> bool:
+        """Take what has arrived by now, if anything; its age is judged by the time of the next sample."""
         if self.stops.waiting or self.inbox.waiting:
             self._arrived = self.stops.drain() + self.inbox.drain()
             self.firmware.dropped_events = self.inbox.dropped
+        return bool(self._arrived)
 
     def step(self, sample: ModuleSample) -> Command:
         """Begin a tick on what was collected before the sample was taken; return the module's command."""
@@ -165,7 +168,11 @@ class HostedModule:
 
 
 class AgentHost:
-    """All modules of one agent process. Declares everything on construction; `close` ends it."""
+    """All modules of one agent process. Declares everything on construction; `close` ends it.
+
+    With simulated modules, most ticks of most modules are run by `QuietTicks`: its own, or those that several
+    hosts of one process share, where this one's modules have the places from `place` on.
+    """
 
     def __init__(
         self,
@@ -174,6 +181,8 @@ class AgentHost:
         transport: Transport,
         configs: Sequence[FirmwareConfig],
         worker: Worker,
+        quiet: QuietTicks | None = None,
+        place: int = 0,
     ):
         self.worker = worker
         self.collection = MotionCollection()
@@ -191,6 +200,13 @@ class AgentHost:
         self._asked: dict[int, AskHistory] = {}
         self._tag = 0
         self._seq = 0
+        self._place = place
+        self._quiet = quiet
+        if isinstance(modules, LoopInside):
+            self._loops = modules
+            self._quiet = quiet = quiet or QuietTicks(len(self.modules))
+            for index, module in enumerate(self.modules):
+                quiet.attach(place + index, module.firmware, modules, index)
         self._declare()
 
     @property
@@ -221,18 +237,62 @@ class AgentHost:
         Raises:
             HardwareLost: no further tick will come.
         """
-        # Before the sample: a process that freezes while it waits gets an old sample when it thaws; by the
-        # time of that sample all commands that arrived meanwhile would be fresh.
-        for module in self.modules:
-            module.collect()
-        samples = self._hardware.receive()
+        busy = self.collect()
+        if self._quiet is not None:
+            readings = self._loops.exchange(self._quiet.pwm.tolist())
+            self.finish(readings, self._quiet.run(readings, busy))
+            return
+        samples, modules = self._hardware.receive(), self.modules
         if self._from_others.waiting:
             self._read_others()
-        modules = self.modules
         commands = [module.step(sample) for module, sample in zip(modules, samples, strict=True)]
         for module, pwm in zip(modules, self._hardware.send(commands), strict=True):
             for outgoing in module.publish(pwm):
                 self._send(module, outgoing)
+        self._attend()
+
+    def collect(self) -> list[int]:
+        """Take what has arrived for the modules; return the places of those for which something has.
+
+        Before the sample: a process that freezes while it waits gets an old sample when it thaws; by the time
+        of that sample all commands that arrived meanwhile would be fresh.
+        """
+        return [self._place + k for k, module in enumerate(self.modules) if module.collect()]
+
+    def finish(self, readings: Readings, results: Sequence[int]) -> None:
+        """Run what quiet ticks have left of a tick: modules that need their objects, and all that is sent."""
+        quiet = self._quiet
+        assert quiet is not None
+        if self._from_others.waiting:
+            # Their times are those of the last tick until the modules are run.
+            for place, module in enumerate(self.modules, self._place):
+                module.now_ns = quiet.before_ns[place]
+            self._read_others()
+        for index, module in enumerate(self.modules):
+            place = self._place + index
+            module.now_ns = quiet.now_ns[place]
+            if results[place] == NOT_QUIET:
+                quiet.load(place)
+                command = module.step(self._loops.take(index, readings[place]))
+                out = module.publish(self._loops.run(index, command))
+                quiet.store(place)
+            elif results[place] == ROW_DUE:
+                out = module.firmware.keep_row(quiet.row(place))
+            else:
+                continue
+            for outgoing in out:
+                self._send(module, outgoing)
+        self._attend()
+
+    @property
+    def has_work(self) -> bool:
+        """Whether `finish` has anything to do in a tick that is quiet for all modules."""
+        listener = self._motion_listener
+        return bool(
+            self._from_others.waiting or listener.has_work or self.collection.has_work or self._findings
+        )
+
+    def _attend(self) -> None:
         if self._motion_listener.has_work:
             self._attend_to_motions()
         if self.collection.has_work:

@@ -69,16 +69,16 @@ class Controller:
     def __init__(self, kind: ModuleType, gains: GainSet, dt_s: float):
         self.gains = gains
         self.follows_motor = closes_on_motor(kind, gains.strategy)
-        self._loops = (
+        self.loops = (
             Pid(gains.position, dt_s),
             Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s(kind)),
             Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm_nm(kind)),
         )
-        self.update: Law = partial(_LAWS[gains.strategy], *self._loops)
+        self.update: Law = partial(_LAWS[gains.strategy], *self.loops)
 
     def reset(self) -> None:
         """Forget all loops' past."""
-        for loop in self._loops:
+        for loop in self.loops:
             loop.reset()
 
 

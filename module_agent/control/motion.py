@@ -102,6 +102,17 @@ class Motion:
         self.last_effort_nm = math.nan if self._effort is None else self._effort[-1]
 
     @property
+    def span_ns(self) -> tuple[int, int]:
+        """The module times at which it begins, and at which it is over."""
+        return self._start_ns, self._end_ns
+
+    @property
+    def targets(self) -> NDArray[np.float64]:
+        """The commands of every millisecond, rows position, velocity and effort, (3, samples)."""
+        effort = [math.nan] * len(self._position) if self._effort is None else self._effort
+        return np.array((self._position, self._velocity, effort))
+
+    @property
     def top_speed_rad_s(self) -> float:
         """The highest commanded speed of the motion."""
         return max(max(self._velocity), -min(self._velocity))

@@ -4,6 +4,8 @@ Target clamp, target low-pass, error, dead zone, P + I + D + punch + feed-forwar
 low-pass. A low-pass is x = a x + (1 - a) x_prev, so 1 means none; `i_clamp` limits the integral's output.
 """
 
+from collections.abc import Sequence
+
 from module_agent.wire.messages import PidGains
 
 
@@ -31,6 +33,35 @@ class Pid:
         self._last: tuple[float, float] | None = None
         self._integral = 0.0
         self._output: float | None = None
+
+    @property
+    def record(self) -> tuple[float, ...]:
+        """The parameters as `tick_kernel.LOOP` has them."""
+        g = self._g
+        return (
+            *(self._kp, g.ki, g.kd, self._ff, g.dead_zone, g.i_clamp, g.punch),
+            *(g.min_target, g.max_target, g.target_lowpass),
+            *(g.min_output, g.max_output, g.output_lowpass, self._dt),
+            *(g.d_on_error, self._plain),
+        )
+
+    @property
+    def memory(self) -> tuple[float, ...]:
+        """The state as `tick_kernel` has it: pairs of whether there is one and its value."""
+        target, last, output = self._target, self._last, self._output
+        return (
+            *((0.0, 0.0) if target is None else (1.0, target)),
+            *((0.0, 0.0, 0.0) if last is None else (1.0, *last)),
+            self._integral,
+            *((0.0, 0.0) if output is None else (1.0, output)),
+        )
+
+    def remember(self, memory: Sequence[float]) -> None:
+        """Go on from a state as `memory` gives it."""
+        has_target, target, has_last, error, measured, self._integral, has_output, output = memory
+        self._target = target if has_target else None
+        self._last = (error, measured) if has_last else None
+        self._output = output if has_output else None
 
     def follow(self, target: float, measured: float) -> float:
         """Return this tick's output; 0, and the past is forgotten, while the target is NaN."""

@@ -21,6 +21,7 @@ Command = LeaseRequest | MotionCommand | Setpoint | GainsCommand
 
 # A copy is as old as the network can hold it, so a few past senders are enough.
 SENDERS_REMEMBERED = 32
+NEVER_NS = 2**63 - 1
 
 
 class Lease:
@@ -45,6 +46,11 @@ class Lease:
     def left_ns(self, now_ns: int) -> int:
         """Return the time until the lease lapses, 0 when it has no holder."""
         return max(0, self._until_ns - now_ns) if self.holder is not None else 0
+
+    @property
+    def until_ns(self) -> int:
+        """When it lapses; never without a holder."""
+        return NEVER_NS if self.holder is None else self._until_ns
 
     def lapsed(self, now_ns: int) -> bool:
         """Return whether the lease has a holder and has run out."""

@@ -28,6 +28,12 @@ class History:
         """The number of the oldest row in the ring."""
         return max(0, self.next_row - self.capacity)
 
+    def keep(self, row: memoryview) -> None:
+        """Add one row by its bytes."""
+        start = self.next_row % self.capacity * ROW.itemsize
+        self._bytes[start : start + ROW.itemsize] = row
+        self.next_row += 1
+
     def append(self, values: tuple[float, ...]) -> None:
         """Add one row: its values in the order of `feedback_rows.ROW`, vectors element by element."""
         pack_row(self._bytes, self.next_row % self.capacity, values)
@@ -63,7 +69,7 @@ class History:
         return self.rows(int(first), int(max(first, end)))
 
 
-_STATE_INDEX = {name: index for index, name in enumerate(STATE_NAMES)}
+STATE_INDEX = {name: index for index, name in enumerate(STATE_NAMES)}
 
 
 class FeedbackStream:
@@ -83,6 +89,20 @@ class FeedbackStream:
         self._due_ns = 0
         self._last_imu_ns = -1
         self._sent_row = 0
+
+    @property
+    def times_ns(self) -> tuple[int, int]:
+        """When the next row is due, and the IMU's time in the last tick."""
+        return self._due_ns, self._last_imu_ns
+
+    @property
+    def periods(self) -> tuple[int, int, int, bool]:
+        """Period of rows, half a tick, period of the IMU [ns], and whether rows wait for the IMU."""
+        return self._period_ns, self._half_tick_ns, self._imu_period_ns, self._waits_for_imu
+
+    def go_on(self, due_ns: int, imu_ns: int) -> None:
+        """Go on from times as `times_ns` gives them."""
+        self._due_ns, self._last_imu_ns = due_ns, imu_ns
 
     def begin_anew(self) -> None:
         """Let a row be due at once, after a clock that went back: the next one would be long in coming."""
@@ -114,7 +134,7 @@ class FeedbackStream:
                 sample.t_ns,
                 sample.imu_t_ns,
                 motion_id,
-                _STATE_INDEX[state],
+                STATE_INDEX[state],
                 sample.position_rad,
                 sample.velocity_rad_s,
                 sample.effort_nm,
@@ -123,7 +143,15 @@ class FeedbackStream:
                 *sample[5:16],
             )
         )
-        first, end = self._sent_row, history.next_row
+        return self._batch()
+
+    def keep(self, row: memoryview) -> tuple[int, int] | None:
+        """Add the row of a tick by its bytes; return the batch complete with it, as `append` does."""
+        self.history.keep(row)
+        return self._batch()
+
+    def _batch(self) -> tuple[int, int] | None:
+        first, end = self._sent_row, self.history.next_row
         if end - first < self._batch_rows:
             return None
         self._sent_row = end

@@ -15,8 +15,10 @@ from module_agent.control.gains import check_gains, default_gains
 from module_agent.control.motion import Motion, check_duration, check_motion, check_setpoint
 from module_agent.firmware.admission import Admission, Lease
 from module_agent.firmware.config import FirmwareConfig, check_config
-from module_agent.firmware.feedback import FeedbackStream
+from module_agent.firmware.feedback import STATE_INDEX, FeedbackStream
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
+from module_agent.firmware.tick_kernel import BRAKE as BRAKE_MOTOR
+from module_agent.firmware.tick_kernel import FOLLOW, MOTION
 from module_agent.hardware.hardware import Modules, ModuleSample
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf
@@ -69,6 +71,25 @@ class Answer(NamedTuple):
 
 
 Outgoing = Publication | Answer
+
+
+class QuietState(NamedTuple):
+    """What a quiet tick needs of a firmware, see `tick_kernel`; `targets` are those of the last command."""
+
+    source: int
+    commanded: bool
+    in_fault: bool
+    fresh_ns: int
+    lifetime_ns: int
+    lease_until_ns: int
+    status_due_ns: int
+    motion: Motion | None
+    motion_id: int
+    state_number: int
+    now_ns: int
+    targets: tuple[float, ...]
+    row_times: tuple[int, int]
+    row_periods: tuple[int, int, int, bool]
 
 
 class Firmware:
@@ -147,6 +168,40 @@ class Firmware:
             self._status_due_ns = self._now_ns + STATUS_PERIOD_NS
             out.append(Publication(Leaf.STATUS, encode(self._status(re=0))))
         return out
+
+    def quiet_state(self) -> QuietState:
+        """Return what quiet ticks after this one need."""
+        state = self.state
+        braking = state == "stopped" or (state == "expired" and self.config.expiry_action == "damping")
+        motion = self._motion
+        return QuietState(
+            source=BRAKE_MOTOR if braking else FOLLOW if motion is None else MOTION,
+            commanded=state in COMMANDED,
+            in_fault=state == "fault",
+            fresh_ns=self._fresh_ns,
+            lifetime_ns=self.config.lifetime_ns,
+            lease_until_ns=self.lease.until_ns,
+            status_due_ns=self._status_due_ns,
+            motion=motion,
+            motion_id=self._record.motion_id if motion and self._record else 0,
+            state_number=STATE_INDEX[state],
+            now_ns=self._now_ns,
+            targets=self._command[:3],
+            row_times=self._rows.times_ns,
+            row_periods=self._rows.periods,
+        )
+
+    def go_on(self, now_ns: int, targets: Sequence[float], due_ns: int, imu_ns: int) -> None:
+        """Go on from the time, the targets and the rows of a quiet tick."""
+        self._now_ns = now_ns
+        position_rad, velocity_rad_s, effort_nm = targets
+        self._command = Command(position_rad, velocity_rad_s, effort_nm)
+        self._rows.go_on(due_ns, imu_ns)
+
+    def keep_row(self, row: memoryview) -> list[Outgoing]:
+        """Keep the feedback row of a quiet tick; return what to send."""
+        batch = self._rows.keep(row)
+        return [] if batch is None else [Publication(Leaf.FEEDBACK, encode(self._feedback(*batch)))]
 
     def _command_of_state(self) -> dict[State, Callable[[], Command]]:
         # While braking, feedback rows go on showing the last targets.

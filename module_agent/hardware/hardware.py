@@ -8,7 +8,9 @@ and a watchdog that turns the motor off when no commands come.
 
 from collections.abc import Sequence
 from enum import IntFlag
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, overload
+
+import numpy as np
 
 from module_agent.control.controller import Command
 from module_agent.model.errors import LostError
@@ -42,6 +44,45 @@ class SensorSample(NamedTuple):
     accel_y_m_s2: float
     accel_z_m_s2: float
     deflection_velocity_rad_s: float = 0.0
+
+
+class Readings(Sequence[SensorSample]):
+    """The newest samples of n modules as one block of memory, which the next tick overwrites.
+
+    floats and integers (n, 17) are the same memory in the order of `SensorSample`; times are in the first two
+    columns of `integers`, all else in the others of `floats`. `block` is that memory as bytes. As a sequence
+    it has the sample of each module, 136 bytes each.
+    """
+
+    def __init__(self, modules: int):
+        self.floats = np.zeros((modules, len(SensorSample._fields)))
+        self.integers = self.floats.view(np.int64)
+        self.block = self.floats.data.cast("B")
+
+    @classmethod
+    def of(cls, samples: "Sequence[SensorSample]") -> "Readings":
+        """Return readings that hold these samples."""
+        readings = cls(len(samples))
+        for index, sample in enumerate(samples):
+            readings.integers[index, :2] = sample[:2]
+            readings.floats[index, 2:] = sample[2:]
+        return readings
+
+    def __len__(self) -> int:
+        return len(self.floats)
+
+    @overload
+    def __getitem__(self, index: int) -> SensorSample: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[SensorSample]: ...
+
+    def __getitem__(self, index: int | slice) -> SensorSample | list[SensorSample]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        # As SensorSample(...), at half the time.
+        values = (*self.integers[index, :2].tolist(), *self.floats[index, 2:].tolist())
+        return tuple.__new__(SensorSample, values)
 
 
 class LimitState(IntFlag):
@@ -180,6 +221,8 @@ class Wires(Protocol):
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
         """Hand over one PWM per module, wait for the next tick, return one sample per module.
+
+        They may be `Readings`, which the next call overwrites.
 
         A PWM is in [-1, 1] and normalised to 48 V, as the gains are: the motor sees the duty
         `clip(pwm * 48 / voltage_v, -1, 1)` of the bus voltage.

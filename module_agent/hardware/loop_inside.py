@@ -5,6 +5,7 @@ says what is in the firmware instead.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from module_agent.control.controller import MOTOR_OFF, Command, Controller
 from module_agent.control.gains import catalogue_limits, default_gains
@@ -12,6 +13,7 @@ from module_agent.hardware.hardware import (
     LimitState,
     ModuleInformation,
     ModuleSample,
+    Readings,
     SensorSample,
     WiredModule,
     Wires,
@@ -26,13 +28,24 @@ DEFAULT_STRATEGY = 3
 FAMILY = "simulated"
 
 
+class DriveState(NamedTuple):
+    """What a quiet tick needs of a drive; `clean` is whether its last sample was good."""
+
+    controller: Controller
+    clean: bool
+    running: bool
+    limit: int
+    pwm: float
+    bounds: tuple[float, float, float]
+
+
 class _Drive:
     """Loops, guard and watchdog of one module."""
 
     def __init__(self, module: WiredModule):
         self._kind = module_type(module.module_type)
         self._dt_s = module.tick_ns / 1e9
-        self._running = False
+        self.running = False
         self.module = module
         self.check = SampleCheck(self._kind)
         self.guard = MotorGuard(self._kind, catalogue_limits(self._kind))
@@ -53,14 +66,14 @@ class _Drive:
         """Return the PWM of one tick; a motor that is off or brakes lets its loops forget their past."""
         position, velocity, effort, brake = command
         if not brake and (position == position or velocity == velocity or effort == effort):
-            self._running = True
+            self.running = True
             speed = sensors.velocity_rad_s
             if self.controller.follows_motor:
                 speed -= sensors.deflection_velocity_rad_s
             pwm = self.controller.update(command, sensors.position_rad, speed, sensors.effort_nm)
             return self.guard.limit(pwm, sensors)
-        if self._running:
-            self._running = False
+        if self.running:
+            self.running = False
             self.controller.reset()
         if brake:
             return self.guard.damping(sensors)
@@ -82,10 +95,11 @@ class LoopInside:
         self._wires = wires
         self._drives = [_Drive(module) for module in wires.modules]
         self.pwm = [0.0] * len(self._drives)
-        self._sensors: Sequence[SensorSample] = ()
-        self._commands: Sequence[Command] = [MOTOR_OFF] * len(self._drives)
-        # The samples that the last commands answered.
-        self._answered: Sequence[SensorSample] = ()
+        self._sensors: list[SensorSample | None] = [None] * len(self._drives)
+        self._commands = [MOTOR_OFF] * len(self._drives)
+        # When the last commands were given, and whether that was in this tick.
+        self._commanded_ns: list[int | None] = [None] * len(self._drives)
+        self._answered = True
         self._sequence = 0
 
     @property
@@ -104,17 +118,12 @@ class LoopInside:
         Raises:
             HardwareLost: no further tick will come.
         """
-        if self._answered is not self._sensors:
+        if not self._answered:
             self._go_on()
-        pwm, read = self.pwm, self._wires.exchange(self.pwm)
-        self._sensors = [
-            drive.check.checked(sensors) for drive, sensors in zip(self._drives, read, strict=True)
-        ]
+        readings = self._wires.exchange(self.pwm)
+        self._answered = False
         self._sequence += 1
-        return [
-            ModuleSample(sensors, u, self._sequence, drive.guard.state, False, drive.check.fault)
-            for drive, sensors, u in zip(self._drives, self._sensors, pwm, strict=True)
-        ]
+        return [self.take(index, sensors) for index, sensors in enumerate(readings)]
 
     def send(self, commands: Sequence[Command]) -> list[float]:
         """Run the loops of all modules on one command each; return their PWM, in force from now on.
@@ -122,24 +131,81 @@ class LoopInside:
         Raises:
             ValueError: not one command per module, or there was no sample yet.
         """
-        sensors = self._sensors
-        if not len(commands) == len(self._drives) == len(sensors):
+        if len(commands) != len(self._drives) or None in self._sensors:
+            read = sum(sensors is not None for sensors in self._sensors)
             raise ValueError(
-                f"{len(commands)} commands for {len(self._drives)} modules, {len(sensors)} of them have been "
+                f"{len(commands)} commands for {len(self._drives)} modules, {read} of them have been "
                 "read: receive a sample first, then send one command per module"
             )
-        self._commands, self._answered = commands, sensors
-        self.pwm = list(map(_Drive.run, self._drives, commands, sensors))
-        return self.pwm
+        self._answered = True
+        return [self.run(index, command) for index, command in enumerate(commands)]
+
+    def exchange(self, pwm: Sequence[float]) -> Readings:
+        """Hand these PWM to the motors, wait for the next tick, return its readings; for `QuietTicks`.
+
+        Raises:
+            HardwareLost: no further tick will come.
+        """
+        self._sequence += 1
+        read = self._wires.exchange(pwm)
+        return read if isinstance(read, Readings) else Readings.of(read)
+
+    def take(self, index: int, read: SensorSample) -> ModuleSample:
+        """Check what one module has read; return its sample."""
+        drive = self._drives[index]
+        sensors = self._sensors[index] = drive.check.checked(read)
+        pwm, limits, fault = self.pwm[index], drive.guard.state, drive.check.fault
+        return ModuleSample(sensors, pwm, self._sequence, limits, False, fault)
+
+    def run(self, index: int, command: Command) -> float:
+        """Run the loops of one module, which has been read, on a command; return its PWM."""
+        sensors = self._sensors[index]
+        assert sensors is not None
+        self._commands[index], self._commanded_ns[index] = command, sensors.t_ns
+        pwm = self.pwm[index] = self._drives[index].run(command, sensors)
+        return pwm
 
     def _go_on(self) -> None:
         """Run the loops on their last commands, or none where the lifetime is over."""
-        answered = self._answered or self._sensors
-        each = zip(self._drives, self._commands, self._sensors, answered, strict=True)
-        self.pwm = [
-            drive.run(command if 0 <= sensors.t_ns - last.t_ns <= drive.lifetime_ns else MOTOR_OFF, sensors)
-            for drive, command, sensors, last in each
-        ]
+        for index, (drive, sensors) in enumerate(zip(self._drives, self._sensors, strict=True)):
+            assert sensors is not None
+            since_ns = self._commanded_ns[index]
+            age_ns = 0 if since_ns is None else sensors.t_ns - since_ns
+            alive = 0 <= age_ns <= drive.lifetime_ns
+            self.pwm[index] = drive.run(self._commands[index] if alive else MOTOR_OFF, sensors)
+
+    def quiet_state(self, index: int) -> DriveState:
+        """Return what quiet ticks after this one need of a module."""
+        drive = self._drives[index]
+        return DriveState(
+            drive.controller,
+            drive.check.is_clean,
+            drive.running,
+            int(drive.guard.state),
+            self.pwm[index],
+            drive.guard.bounds,
+        )
+
+    def most(self, index: int) -> tuple[float, ...]:
+        """Return the largest readings of a working module, from the position on in the order of a sample."""
+        return self._drives[index].check.most
+
+    def go_on(
+        self,
+        index: int,
+        last: SensorSample,
+        pwm: float,
+        running: bool,
+        limit: int,
+        memory: Sequence[Sequence[float]],
+    ) -> None:
+        """Go on from what a quiet tick has left of a module: its sample, PWM, and the memory of its loops."""
+        drive = self._drives[index]
+        drive.check.go_on(last)
+        drive.running, drive.guard.state = running, LimitState(limit)
+        self.pwm[index] = pwm
+        for loop, own in zip(drive.controller.loops, memory, strict=True):
+            loop.remember(own)
 
     def set_gains(self, index: int, gains: GainSet) -> None:
         """Replace the gains of a module from the next `send` on; its loops forget their past."""

@@ -1,5 +1,7 @@
 """The output stage of a module: limits of temperature and position, and the brake."""
 
+import math
+
 from module_agent.control.controller import NOMINAL_VOLTAGE_V
 from module_agent.hardware.hardware import LimitState, SensorSample
 from module_agent.model.catalogue import ModuleType
@@ -18,6 +20,13 @@ class MotorGuard:
         self._high_rad = limits.max_position_rad
         self._max_motor_rad_s = kind.gear_ratio * kind.max_speed_rad_s
         self.state = LimitState.NONE
+
+    @property
+    def bounds(self) -> tuple[float, float, float]:
+        """The lowest and highest position, infinite without, and the speed at which the motor is unloaded."""
+        low = -math.inf if self._low_rad is None else self._low_rad
+        high = math.inf if self._high_rad is None else self._high_rad
+        return low, high, self._max_motor_rad_s
 
     def limit(self, pwm: float, sample: SensorSample) -> float:
         """Keep the duty below the winding's ceiling 1 - 1/(155 - T), and never drive out of the range."""

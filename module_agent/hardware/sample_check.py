@@ -28,7 +28,7 @@ class SampleCheck:
         speed, effort = _OVER_SPEED * kind.max_speed_rad_s, _OVER_EFFORT * kind.max_effort_nm
         motor = speed * kind.gear_ratio
         # In the order of a sample's fields from the position on.
-        self._most = (
+        self.most = (
             *(_TURNS_RAD, speed, effort, _DEFLECTION_RAD, motor, _CURRENT_A, _HOT_C, _VOLTAGE_V),
             *(_GYRO_RAD_S,) * 3,
             *(_ACCELERATION_M_S2,) * 3,
@@ -38,17 +38,26 @@ class SampleCheck:
         self._held = MAX_HELD
         self.fault = ""
 
+    @property
+    def is_clean(self) -> bool:
+        """Whether the last sample was good, so that a good one changes nothing but the last."""
+        return self._held == 0
+
+    def go_on(self, last: SensorSample) -> None:
+        """Take a sample as the last one, which was good."""
+        self._last = last
+
     def checked(self, sample: SensorSample) -> SensorSample:
         """Return the sample, with the last good value in place of each bad one."""
         # A comparison with NaN is false.
-        if all(map(le, map(abs, sample[_TIMES:]), self._most)):
+        if all(map(le, map(abs, sample[_TIMES:]), self.most)):
             self._last, self._held, self.fault = sample, 0, ""
             return sample
         return self._replaced(sample)
 
     def _replaced(self, sample: SensorSample) -> SensorSample:
         values = list(sample)
-        for index, most in enumerate(self._most, start=_TIMES):
+        for index, most in enumerate(self.most, start=_TIMES):
             if not abs(sample[index]) <= most:
                 values[index] = self._last[index]
                 if self._held >= MAX_HELD:

@@ -27,6 +27,7 @@ GROUPS = {
         "sim.sensors.sensors",
     ),
     "regressor": ("module_agent.model.regressor_kernel",),
+    "firmware": ("module_agent.firmware.tick_kernel",),
 }
 # Enough for the IMU to be read.
 TICKS = 10
@@ -55,6 +56,7 @@ def compile_group(modules: tuple[str, ...]) -> None:
 
 def call_kernels() -> None:
     """Call every kernel with arguments of the types that a run has."""
+    from module_agent.firmware.quiet_ticks import QuietTicks
     from module_agent.model.regressor import torque_regressor
     from sim.robot.robot_file import load_robot
     from sim.robot.robot_tree import true_chain
@@ -64,7 +66,8 @@ def call_kernels() -> None:
     still = np.zeros((1, len(robot.modules)))
     world = World(robot, seed=1)
     for _ in range(TICKS):
-        world.step(still[0].tolist())
+        readings = world.exchange(still[0].tolist())
+    QuietTicks(len(readings)).run(readings, busy=[])
     world.close()
     torque_regressor(true_chain(robot), still, still, still)
 

@@ -1,11 +1,11 @@
-"""Readings of all sensors of the modules from the true state: one `SensorSample` per module and tick."""
+"""Readings of all sensors of the modules from the true state: one sample per module and tick."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import Readings
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.compiled import compiled
 from sim.geometry.pose import Array
@@ -72,8 +72,8 @@ class Sensors:
         """Whether `read` at this tick needs the IMU's truth of this instant."""
         return self._imus.every_tick or tick % self._imu_ticks == 0
 
-    def read(self, tick: int, truth: Instant) -> list[SensorSample]:
-        """Return one sample per module. To be called once a tick, in order."""
+    def read(self, tick: int, truth: Instant, readings: Readings) -> None:
+        """Write one sample per module into `readings`. To be called once a tick, in order."""
         now = [module_time(clock, truth.t_ns) for clock in self.clocks]
         if self.imu_due(tick):
             self._imus.advance(truth.gyro_rad_s, truth.specific_force_m_s2)
@@ -81,27 +81,34 @@ class Sensors:
             self._imu_values = self._imus.read(truth.motor_rad_s)
             self._imu_ns = now
         joint = self._joints.read(truth.q_rad, truth.qd_rad_s, truth.motor_rad_s, truth.elastic_nm)
-        rows = _rows(
-            joint, self._gear, truth.current_a, truth.winding_c, truth.voltage_v, self._imu_values
-        ).tolist()
-        # As SensorSample(t, imu, *row), at half the time.
-        make = tuple.__new__
-        return [
-            make(SensorSample, (t, imu, *row)) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)
-        ]
+        readings.integers[:, 0] = now
+        readings.integers[:, 1] = self._imu_ns
+        _fill(
+            readings.floats,
+            joint,
+            self._gear,
+            truth.current_a,
+            truth.winding_c,
+            truth.voltage_v,
+            self._imu_values,
+        )
 
 
 @compiled
-def _rows(
-    joint: Array, gear: Array, current_a: Array, winding_c: Array, voltage_v: float, imu: Array
-) -> Array:
-    """Return the values of samples (n, 15), in the order of a sample's fields after its times."""
-    values = np.empty((joint.shape[0], 15))
+def _fill(
+    readings: Array,
+    joint: Array,
+    gear: Array,
+    current_a: Array,
+    winding_c: Array,
+    voltage_v: float,
+    imu: Array,
+) -> None:
+    """Write the values of samples (n, 17), in the order of a sample's fields, but for its times."""
     for i in range(joint.shape[0]):
         for k in range(4):
-            values[i, k] = joint[i, k]
-        values[i, 4], values[i, 14] = joint[i, 4] * gear[i], joint[i, 5]
-        values[i, 5], values[i, 6], values[i, 7] = current_a[i], winding_c[i], voltage_v
+            readings[i, 2 + k] = joint[i, k]
+        readings[i, 6], readings[i, 16] = joint[i, 4] * gear[i], joint[i, 5]
+        readings[i, 7], readings[i, 8], readings[i, 9] = current_a[i], winding_c[i], voltage_v
         for k in range(6):
-            values[i, 8 + k] = imu[i, k]
-    return values
+            readings[i, 10 + k] = imu[i, k]

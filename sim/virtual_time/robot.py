@@ -9,6 +9,7 @@ import numpy as np
 
 from coordinator.runtime.event_loop import Interruption, run_to_end
 from module_agent.firmware.config import config_of
+from module_agent.firmware.quiet_ticks import QUIET, QuietTicks
 from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.host import AgentHost, InlineWorker
@@ -56,7 +57,7 @@ class _Wires:
         return (self._robot.world.modules[self._index],)
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        return (self._robot.samples[self._index],)
+        return (self._robot.world.readings[self._index],)
 
     def close(self) -> None:
         self._robot.pwm[self._index] = 0.0
@@ -104,12 +105,11 @@ class VirtualRobot:
         self.network = VirtualNetwork(loop) if network is None else network
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.serials)
-        self.samples: Sequence[SensorSample] = ()
+        self._quiet = QuietTicks(len(self.serials))
         self.on_tick: list[Callable[[], None]] = []
         self._profile = settings.profile
         self._endpoint_seeds, self._boot_ids = self._draws(settings)
         self._firmware = firmware
-        self._loops: dict[str, LoopInside] = {}
         self.hosts: dict[str, AgentHost] = {}
         for serial in self.serials:
             self.boot(serial)
@@ -135,10 +135,14 @@ class VirtualRobot:
 
     def boot(self, serial: str, **firmware: Any) -> None:
         """Start the agent of a module under a new boot id; `firmware` are settings of this module alone."""
-        modules = self._loops[serial] = LoopInside(_Wires(self, self.serials.index(serial)))
-        config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)
+        place = self._index[serial]
+        modules = LoopInside(_Wires(self, place))
+        config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)._replace(
+            **firmware
+        )
+        endpoint = self.endpoint(serial)
         self.hosts[serial] = AgentHost(
-            self.robot.name, modules, self.endpoint(serial), [config._replace(**firmware)], InlineWorker()
+            self.robot.name, modules, endpoint, [config], InlineWorker(), self._quiet, place
         )
 
     def start(self) -> None:
@@ -149,10 +153,16 @@ class VirtualRobot:
     def _tick(self) -> None:
         if not self._running:
             return
-        self.samples = self.truth.step(self.pwm)
-        for serial, host in list(self.hosts.items()):
-            host.cycle()
-            (self.pwm[self._index[serial]],) = self._loops[serial].pwm
+        hosts, quiet = list(self.hosts.items()), self._quiet
+        busy = [place for _, host in hosts for place in host.collect()]
+        readings = self.truth.step(self.pwm)
+        results = quiet.run(readings, busy)
+        for serial, host in hosts:
+            if results[self._index[serial]] != QUIET or host.has_work:
+                host.finish(readings, results)
+        pwm = quiet.pwm.tolist()
+        for serial, _ in hosts:
+            self.pwm[self._index[serial]] = pwm[self._index[serial]]
         for call in self.on_tick:
             call()
         self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
@@ -165,7 +175,8 @@ class VirtualRobot:
     def freeze(self, serial: str) -> None:
         """Run an agent no more, as SIGSTOP does: its motor gets zero PWM, its endpoint stays."""
         del self.hosts[serial]
-        self.pwm[self.serials.index(serial)] = 0.0
+        self._quiet.detach(self._index[serial])
+        self.pwm[self._index[serial]] = 0.0
 
     def complete(
         self,

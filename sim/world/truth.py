@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import Readings
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
 from module_agent.model.files import replacing, write_json
@@ -122,9 +122,9 @@ class TruthLog:
         self._t_ns: list[int] = []
         self._rows: list[tuple[Array, Array, Array]] = []
 
-    def step(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        """Step the world, record the instant of its samples if it is due, and return them."""
-        samples = self._world.step(pwm)
+    def step(self, pwm: Sequence[float]) -> Readings:
+        """Step the world, record the instant of its samples if it is due, and return its readings."""
+        samples = self._world.exchange(pwm)
         if self._ticks % self._every == 0:
             plant = self._world.plant
             self._t_ns.append(plant.t_ns)

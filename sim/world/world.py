@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
+from module_agent.hardware.hardware import HardwareLost, Readings, SensorSample, WiredModule
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import UsageError
 from module_agent.model.read_only import read_only
@@ -107,6 +107,7 @@ class World:
         variation = draw_variation(seed, robot.serials, self.profile)
         self._actuators = Actuators(types, TICK_S, self.profile, variation, self._skeleton, voltage_v)
         self._tick = 0
+        self.readings = Readings(len(types))
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
         self._pushes: list[Push] = []
@@ -203,6 +204,10 @@ class World:
             ValueError: a PWM is missing, too many or not finite.
             HardwareLost: the world is closed.
         """
+        return list(self.exchange(pwm))
+
+    def exchange(self, pwm: Sequence[float]) -> Readings:
+        """Advance as `step` does; return `readings`, which hold the samples until the next call."""
         u, t_ns = self._checked(pwm), self._tick * TICK_NS
         actuators, q, qd = self._actuators, self._q, self._qd
         motor = actuators.state.motor_rad
@@ -227,12 +232,10 @@ class World:
         )
         if self.sensors.imu_due(self._tick):
             self._imu_readings = self._tree.imu_readings(q, rate, change)
-        samples = self.sensors.read(self._tick, self._instant(t_ns, own_q, own_rate))
+        self.sensors.read(self._tick, self._instant(t_ns, own_q, own_rate), self.readings)
         self._windings.step(drives.copper_w)
         self._tick += 1
-        return samples
-
-    exchange = step
+        return self.readings
 
     def close(self) -> None:
         """End the world. May be called twice."""
@@ -274,7 +277,7 @@ class World:
         actuators = copy(self._actuators)
         actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
         copy(self._windings).step(actuators.state.copper_w)
-        sensors.read(0, self._instant(0, self._q[self._joints], idle))
+        sensors.read(0, self._instant(0, self._q[self._joints], idle), self.readings)
 
     def _instant(self, t_ns: int, q: Array, rate: Array) -> Instant:
         """Return the truth for the sensors, from the modules' own joints (n,)."""

@@ -3,6 +3,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from module_agent.hardware.hardware import Readings
 from module_agent.model.catalogue import module_type
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.sensors.sensors import Instant, Sensors
@@ -50,7 +51,9 @@ class Bench:
                 specific_force_m_s2=force[k],
                 **values,  # type: ignore[arg-type]
             )
-            rows.append(self.sensors.read(self._tick, instant))
+            readings = Readings(*self._shape)
+            self.sensors.read(self._tick, instant, readings)
+            rows.append(list(readings))
             self._tick += 1
         return np.array(rows)
 

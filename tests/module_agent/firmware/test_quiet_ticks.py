@@ -1,0 +1,343 @@
+"""Quiet ticks in machine code and ticks of the Python objects are the same ticks, to the bit."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from module_agent.control import controller
+from module_agent.control.gains import default_gains
+from module_agent.firmware import firmware, tick_kernel
+from module_agent.firmware.config import config_of
+from module_agent.hardware import motor_guard
+from module_agent.hardware.hardware import LimitState, ModuleSample, SensorSample, WiredModule
+from module_agent.hardware.loop_inside import LoopInside
+from module_agent.host import AgentHost, InlineWorker
+from module_agent.model.catalogue import module_type
+from module_agent.transport.transport import Event, Request, Sample
+from module_agent.wire.codec import encode
+from module_agent.wire.keys import Leaf, key
+from module_agent.wire.messages import (
+    Ask,
+    ConstantMotion,
+    DynamicPattern,
+    GainsCommand,
+    GoTo,
+    LeaseRequest,
+    MotionCommand,
+    Rest,
+    Setpoint,
+    Stop,
+    WindowedSine,
+)
+
+ROBOT, MS = "arm", 1_000_000
+TYPES = ("X5-1", "X5-4", "X5-9")
+SERIALS = ("A", "B", "C")
+BOOT = 7
+
+
+class Scripted:
+    """Wires to three modules that read what the test says."""
+
+    def __init__(self) -> None:
+        self.modules = tuple(
+            WiredModule(serial, kind, MS, 4 * MS) for serial, kind in zip(SERIALS, TYPES, strict=True)
+        )
+        self.samples: list[SensorSample] = []
+        self.pwm: list[list[float]] = []
+
+    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        self.pwm.append(list(pwm))
+        return self.samples
+
+    def close(self) -> None:
+        pass
+
+
+class Plain:
+    """The same modules, of which a host does not know that their quiet ticks are compiled."""
+
+    def __init__(self, loops: LoopInside):
+        self._loops = loops
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loops, name)
+
+
+class Handle:
+    def undeclare(self) -> None:
+        pass
+
+
+class Network:
+    """A transport that keeps what is published and answered."""
+
+    def __init__(self) -> None:
+        self.sinks: dict[str, Callable[[Event], None]] = {}
+        self.sent: list[tuple[str, bytes]] = []
+
+    def publish(self, at: str, payload: bytes) -> None:
+        self.sent.append((at, payload))
+
+    def _declare(self, at: str, sink: Callable[[Event], None]) -> Handle:
+        self.sinks[at] = sink
+        return Handle()
+
+    serve = subscribe = _declare
+
+    def declare_alive(self, at: str) -> Handle:
+        return Handle()
+
+    def close(self) -> None:
+        pass
+
+    def tell(self, serial: str, leaf: Leaf, payload: bytes) -> None:
+        at = key(ROBOT, serial, leaf)
+        if leaf is Leaf.SETPOINT:
+            self.sinks[at](Sample(at, payload))
+        else:
+            self.sinks[at](Request(at, payload, lambda answer: self.sent.append((at + " answer", answer))))
+
+
+class Agent:
+    """One agent process of three modules, whose quiet ticks are compiled or not."""
+
+    def __init__(self, is_compiled: bool, strategy: int, expiry: str, rate_hz: float):
+        self.wires, self.network = Scripted(), Network()
+        loops = LoopInside(self.wires)
+        modules: Any = loops if is_compiled else Plain(loops)
+        configs = [
+            config_of(
+                one,
+                BOOT,
+                strategy=strategy,
+                expiry_action=expiry,
+                feedback_rate_hz=rate_hz,
+                lifetime_ns=40 * MS,
+            )
+            for one in loops.information
+        ]
+        self.host = AgentHost(ROBOT, modules, self.network, configs, InlineWorker())
+
+    def tick(self, samples: list[SensorSample]) -> None:
+        self.wires.samples = samples
+        self.host.cycle()
+
+    @property
+    def everything(self) -> tuple[Any, ...]:
+        """What can be seen of the agent from outside, and the state of its firmwares."""
+        states = [module.firmware.state for module in self.host.modules]
+        rows = [
+            module.firmware.history.block(0, module.firmware.history.next_row) for module in self.host.modules
+        ]
+        return self.wires.pwm, self.network.sent, states, rows
+
+
+LOOP = st.fixed_dictionaries(
+    {
+        "kp": st.floats(0.1, 5.0),
+        "ki": st.sampled_from([0.0, 3.0]),
+        "kd": st.sampled_from([0.0, 0.02]),
+        "feed_forward": st.sampled_from([0.0, 1.0]),
+        "dead_zone": st.sampled_from([0.0, 0.01]),
+        "i_clamp": st.sampled_from([0.01, 0.25]),
+        "punch": st.sampled_from([0.0, 0.02]),
+        "target_lowpass": st.sampled_from([1.0, 0.3]),
+        "output_lowpass": st.sampled_from([1.0, 0.5]),
+        "d_on_error": st.booleans(),
+    }
+)
+ACTIONS = st.one_of(
+    st.tuples(st.just("ticks"), st.integers(1, 60)),
+    st.tuples(st.just("acquire"), st.integers(0, 2)),
+    st.tuples(st.just("renew"), st.integers(0, 2)),
+    st.tuples(st.just("release"), st.integers(0, 2)),
+    st.tuples(st.just("stop"), st.integers(0, 2)),
+    st.tuples(st.just("ask"), st.integers(0, 2)),
+    st.tuples(
+        st.just("motion"),
+        st.integers(0, 2),
+        st.sampled_from(
+            [
+                Rest(duration_s=0.02),
+                GoTo(target_rad=0.2, max_speed_rad_s=1.0),
+                ConstantMotion(velocity_rad_s=0.4, duration_s=0.05, ramp_s=0.01),
+                WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=0.06, sigma_s=0.02),
+                DynamicPattern(amplitude_rad=0.1, half_width_s=0.02, sigma_s=0.01, repeats=2),
+            ]
+        ),
+    ),
+    st.tuples(
+        st.just("aim"),
+        st.integers(0, 2),
+        st.tuples(
+            *(st.one_of(st.none(), st.floats(-0.5, 0.5)),) * 2, st.one_of(st.none(), st.floats(-2.0, 2.0))
+        ),
+    ),
+    st.tuples(st.just("gains"), st.integers(0, 2), st.integers(0, 4), st.tuples(LOOP, LOOP, LOOP)),
+    st.tuples(
+        st.just("sick"),
+        st.integers(0, 2),
+        st.sampled_from(["velocity_rad_s", "effort_nm", "accel_x_m_s2", "winding_temperature_c"]),
+        st.sampled_from([float("nan"), float("inf"), 1e7]),
+        st.integers(1, 9),
+    ),
+    st.tuples(st.just("hot"), st.integers(0, 2), st.floats(100.0, 160.0)),
+    st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([0.0, 12.0, 24.0, 48.0])),
+    st.tuples(st.just("clock"), st.integers(0, 2), st.sampled_from([-700, -1, 3, 300])),
+)
+
+
+class Life:
+    """The same random life of two agents."""
+
+    def __init__(self, agents: Sequence[Agent], seed: int):
+        self._agents = agents
+        self._rng = np.random.default_rng(seed)
+        self._now = [10**12 + 17 * k for k in range(3)]
+        self._imu = [0, 0, 0]
+        self._tick = 0
+        self._q = np.zeros(3)
+        self._winding, self._voltage = [40.0] * 3, [24.0] * 3
+        self._sick: dict[int, tuple[str, float, int]] = {}
+        self._seq = self._motions = 0
+
+    def ticks(self, count: int) -> None:
+        for _ in range(count):
+            self._tick += 1
+            self._q += self._rng.normal(0.0, 0.002, 3)
+            samples = [self._sample(k) for k in range(3)]
+            for agent in self._agents:
+                agent.tick(samples)
+
+    def _sample(self, k: int) -> SensorSample:
+        self._now[k] += MS + int(self._rng.integers(-20, 20))
+        if self._tick % 4 == k:
+            self._imu[k] = self._now[k]
+        random = self._rng.normal(0.0, 0.3, 12).tolist()
+        values = dict(
+            zip(
+                SensorSample._fields,
+                (
+                    *(self._now[k], self._imu[k], float(self._q[k]), *random[:5]),
+                    *(self._winding[k], self._voltage[k], *random[5:]),
+                ),
+                strict=True,
+            )
+        )
+        name, value, left = self._sick.get(k, ("", 0.0, 0))
+        if left:
+            values[name] = value
+            self._sick[k] = name, value, left - 1
+        return SensorSample(**values)  # type: ignore[arg-type]
+
+    def act(self, action: tuple[Any, ...]) -> None:
+        what, *rest = action
+        if what == "ticks":
+            self.ticks(rest[0])
+            return
+        k = rest[0]
+        if what == "sick":
+            self._sick[k] = rest[1], rest[2], rest[3]
+        elif what == "hot":
+            self._winding[k] = rest[1]
+        elif what == "voltage":
+            self._voltage[k] = rest[1]
+        elif what == "clock":
+            self._now[k] += rest[1] * MS
+        else:
+            self._tell(k, what, *rest[1:])
+        self.ticks(1)
+
+    def _tell(self, k: int, what: str, *rest: Any) -> None:
+        self._seq += 1
+        module = self._agents[0].host.modules[k].firmware
+        head: dict[str, Any] = {"serial": SERIALS[k], "boot": BOOT, "seq": self._seq, "sender": "me"}
+        command = {**head, "token": module.lease.token, "echo_ns": max(0, self._now[k])}
+        if what in ("acquire", "renew", "release"):
+            leaf, message = Leaf.LEASE, LeaseRequest(**command, action=what, duration_ns=90 * MS)
+        elif what == "stop":
+            leaf, message = Leaf.STOP, Stop(**head, why="test")  # type: ignore[assignment]
+        elif what == "ask":
+            leaf, message = Leaf.STATUS, Ask(**head)  # type: ignore[assignment]
+        elif what == "motion":
+            self._motions += 1
+            message = MotionCommand(**command, motion_id=self._motions, pattern=rest[0])  # type: ignore[assignment]
+            leaf = Leaf.MOTION
+        elif what == "aim":
+            aims = dict(zip(("position_rad", "velocity_rad_s", "effort_nm"), rest[0], strict=True))
+            leaf, message = Leaf.SETPOINT, Setpoint(**command, **aims)  # type: ignore[assignment]
+        else:
+            gains = default_gains(module_type(TYPES[k]), rest[0])
+            names = ("position", "velocity", "effort")
+            loops = {
+                name: getattr(gains, name).model_copy(update=changes)
+                for name, changes in zip(names, rest[1], strict=True)
+            }
+            leaf = Leaf.GAINS
+            message = GainsCommand(**command, gains=gains.model_copy(update=loops))  # type: ignore[assignment]
+        for agent in self._agents:
+            agent.network.tell(SERIALS[k], leaf, encode(message))
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(ACTIONS, min_size=5, max_size=40),
+    st.integers(0, 4),
+    st.sampled_from(["motor_off", "hold", "damping"]),
+    st.sampled_from([250.0, 400.0, 1000.0]),
+    st.integers(0, 2**20),
+)
+def test_compiled_quiet_ticks_and_python_ticks_are_equal_to_the_bit(
+    actions: list[tuple[Any, ...]], strategy: int, expiry: str, rate_hz: float, seed: int
+) -> None:
+    agents = [Agent(is_compiled, strategy, expiry, rate_hz) for is_compiled in (True, False)]
+    life = Life(agents, seed)
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+    for action in actions:
+        life.act(action)
+    compiled, plain = (agent.everything for agent in agents)
+    for one, other in zip(compiled, plain, strict=True):
+        assert repr(one) == repr(other)
+    # As text, in which NaN is equal to NaN and 0.0 is not -0.0.
+    assert repr(compiled) == repr(plain)
+
+
+def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An idle module needs its Python objects for its statuses, and for nothing else."""
+    agent = Agent(True, 3, "hold", 250.0)
+    life = Life([agent], 1)
+    life.ticks(3)
+    taken: list[int] = []
+    take = LoopInside.take
+
+    def counted(self: LoopInside, index: int, read: SensorSample) -> ModuleSample:
+        taken.append(index)
+        return take(self, index, read)
+
+    monkeypatch.setattr(LoopInside, "take", counted)
+    life.ticks(2100)
+    # Idle, a module has a status every 400 ms.
+    assert len(taken) == 3 * 5
+
+
+def test_the_kernels_constants_are_those_of_the_objects() -> None:
+    assert tick_kernel.NOMINAL_VOLTAGE_V == controller.NOMINAL_VOLTAGE_V
+    assert tick_kernel.CEILING_LIMIT_C == motor_guard.CEILING_LIMIT_C
+    assert tick_kernel.DAMPING_LIMIT_PWM == motor_guard.DAMPING_LIMIT_PWM
+    assert tick_kernel.WINDING_LIMIT_C == firmware.WINDING_LIMIT_C
+    named = (LimitState.NONE, LimitState.POSITION, LimitState.TEMPERATURE, LimitState.OVER_TEMPERATURE)
+    kernels = (
+        tick_kernel.LIMIT_NONE,
+        tick_kernel.LIMIT_POSITION,
+        tick_kernel.LIMIT_TEMPERATURE,
+        tick_kernel.LIMIT_OVER_TEMPERATURE,
+    )
+    assert kernels == tuple(map(int, named))
+    assert len(SensorSample._fields) == tick_kernel.COLUMNS
