@@ -11,7 +11,7 @@ from module_agent.hardware.bus_frames import (
     pack_hello,
     unpack_welcome,
 )
-from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
+from module_agent.hardware.hardware import HardwareLost, Readings, WiredModule
 
 _RETRY_S = 0.02
 
@@ -41,13 +41,14 @@ class BusClient:
         except BaseException:
             self._socket.close()
             raise
+        self._readings = Readings(len(self._modules))
 
     @property
     def modules(self) -> Sequence[WiredModule]:
         """The modules served, in the order asked for."""
         return self._modules
 
-    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+    def exchange(self, pwm: Sequence[float]) -> Readings:
         """Answer the last tick with one PWM in [-1, 1] per module and wait for the next.
 
         Raises:
@@ -58,16 +59,16 @@ class BusClient:
             raise ValueError(f"{len(pwm)} PWM values for {len(self._modules)} modules")
         try:
             self._socket.send(self._frames.pack_pwm(self._tick, pwm))
-            frame = self._socket.recv(self._frames.samples.size + 1)
+            frame = self._socket.recv(self._frames.samples_bytes + 1)
         except OSError as error:
             raise HardwareLost(f"the physics bus is gone: {error.strerror or error}") from error
         if not frame:
             raise HardwareLost("the physics bus is gone: the world closed it")
         try:
-            self._tick, samples = self._frames.unpack_samples(frame)
+            self._tick = self._frames.unpack_samples(frame, self._readings)
         except FrameError as error:
             raise HardwareLost(f"the physics bus is out of step: {error}") from error
-        return samples
+        return self._readings
 
     def close(self) -> None:
         """Release the modules; a thread that waits in `exchange` gets `HardwareLost`. May be called twice."""

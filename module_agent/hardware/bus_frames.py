@@ -18,18 +18,17 @@ Each side waits for the other: a welcome or samples frame is answered by one pwm
 
 import struct
 from collections.abc import Sequence
-from itertools import chain
 from typing import Any, NamedTuple
 
 import msgpack
 
-from module_agent.hardware.hardware import SensorSample, WiredModule
+from module_agent.hardware.hardware import Readings, SensorSample, WiredModule
 from module_agent.model.errors import RobotError
 
 BUS_VERSION = 2
 MAX_HANDSHAKE_BYTES = 64 * 1024
 _TICK = struct.Struct("<Q")
-_SAMPLE = struct.Struct("<qq15d")
+SAMPLE_BYTES = 8 * len(SensorSample._fields)
 
 
 class FrameError(RobotError):
@@ -39,29 +38,31 @@ class FrameError(RobotError):
 class TickFrames(NamedTuple):
     """The layouts of both tick frames for an agent with a given number of modules."""
 
-    samples: struct.Struct
+    samples_bytes: int
     pwm: struct.Struct
 
     @classmethod
     def of(cls, modules: int) -> "TickFrames":
         """Return the layouts for `modules` modules."""
-        return cls(struct.Struct("<Q" + "qq15d" * modules), struct.Struct(f"<Q{modules}d"))
+        return cls(_TICK.size + modules * SAMPLE_BYTES, struct.Struct(f"<Q{modules}d"))
 
-    def pack_samples(self, tick: int, samples: Sequence[SensorSample]) -> bytes:
-        """Return the samples frame of a tick."""
-        return self.samples.pack(tick, *chain.from_iterable(samples))
+    def pack_samples(self, tick: int, readings: Readings, slots: Sequence[int]) -> bytes:
+        """Return the samples frame of a tick, with the readings of the modules in these slots."""
+        size = SAMPLE_BYTES
+        parts = (readings.block[slot * size : (slot + 1) * size] for slot in slots)
+        return b"".join((_TICK.pack(tick), *parts))
 
-    def unpack_samples(self, frame: bytes) -> tuple[int, list[SensorSample]]:
-        """Return the tick number and one sample per module.
+    def unpack_samples(self, frame: bytes, readings: Readings) -> int:
+        """Write the samples of a frame into `readings`; return its tick number.
 
         Raises:
             FrameError: the frame has another length.
         """
-        if len(frame) != self.samples.size:
-            raise FrameError(f"a samples frame has {self.samples.size} bytes, this one {len(frame)}")
+        if len(frame) != self.samples_bytes:
+            raise FrameError(f"a samples frame has {self.samples_bytes} bytes, this one {len(frame)}")
+        readings.block[:] = frame[_TICK.size :]
         (tick,) = _TICK.unpack_from(frame)
-        make = SensorSample._make
-        return tick, [make(values) for values in _SAMPLE.iter_unpack(frame[_TICK.size :])]
+        return int(tick)
 
     def pack_pwm(self, tick: int, pwm: Sequence[float]) -> bytes:
         """Return the pwm frame that answers a tick."""

@@ -155,7 +155,7 @@ class VirtualRobot:
             return
         hosts, quiet = list(self.hosts.items()), self._quiet
         busy = [place for _, host in hosts for place in host.collect()]
-        readings = self.truth.step(self.pwm)
+        readings = self.truth.exchange(self.pwm)
         results = quiet.run(readings, busy)
         for serial, host in hosts:
             if results[self._index[serial]] != QUIET or host.has_work:

@@ -28,7 +28,7 @@ from module_agent.hardware.bus_frames import (
     pack_welcome,
     unpack_hello,
 )
-from module_agent.hardware.hardware import SensorSample, WiredModule
+from module_agent.hardware.hardware import Readings, WiredModule
 from module_agent.model.errors import UsageError
 
 _BACKLOG = 128
@@ -48,10 +48,10 @@ class World(Protocol):
 
     @property
     def modules(self) -> Sequence[WiredModule]:
-        """The modules, in the order of `step`."""
+        """The modules, in the order of `exchange`."""
         ...
 
-    def step(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+    def exchange(self, pwm: Sequence[float]) -> Readings:
         """Advance by one tick and return one sample per module."""
         ...
 
@@ -143,14 +143,14 @@ class BusServer:
             self._attend(descriptor)
         if self._before_hello:
             self._drop_squatters()
-        samples = self._world.step(tuple(self._pwm))
+        readings = self._world.exchange(tuple(self._pwm))
         self._tick += 1
         if self._tick % _WINDOW_TICKS == 0:
             for agent in self._inside.values():
                 agent.late_ticks = 0
         for agent in list(self._inside.values()):
             agent.owes_tick = self._tick
-            self._send(agent, agent.frames.pack_samples(self._tick, [samples[slot] for slot in agent.slots]))
+            self._send(agent, agent.frames.pack_samples(self._tick, readings, agent.slots))
 
     def run(self, speed: float | None, stop: Callable[[], bool], tick_s: float = 0.001) -> RunReport:
         """Tick until `stop()`, at `speed` times real time, or as fast as it goes when None; then close.

@@ -122,7 +122,7 @@ class TruthLog:
         self._t_ns: list[int] = []
         self._rows: list[tuple[Array, Array, Array]] = []
 
-    def step(self, pwm: Sequence[float]) -> Readings:
+    def exchange(self, pwm: Sequence[float]) -> Readings:
         """Step the world, record the instant of its samples if it is due, and return its readings."""
         samples = self._world.exchange(pwm)
         if self._ticks % self._every == 0:

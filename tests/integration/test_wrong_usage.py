@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from module_agent.hardware.hardware import WiredModule
+from module_agent.hardware.hardware import Readings, WiredModule
 from sim.world.bus_server import BusServer
 
 ROBOT = "thesis_171_horizontal"
@@ -71,8 +71,8 @@ class OneModule:
 
     modules = (WiredModule("A-1", "X5-1", 1_000_000, 4_000_000),)
 
-    def step(self, pwm):
-        return [None]
+    def exchange(self, pwm):
+        return Readings(1)
 
 
 @pytest.fixture

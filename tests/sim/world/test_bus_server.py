@@ -26,7 +26,7 @@ from module_agent.hardware.bus_frames import (
     unpack_hello,
     unpack_welcome,
 )
-from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
+from module_agent.hardware.hardware import HardwareLost, Readings, SensorSample, WiredModule
 from module_agent.model.errors import UsageError
 from sim.world import bus_server
 from sim.world.bus_server import BusInUse, BusServer
@@ -70,10 +70,11 @@ class EchoWorld:
         self.steps = 0
         self.pwm: Sequence[float] = ()
 
-    def step(self, pwm: Sequence[float]) -> list[SensorSample]:
+    def exchange(self, pwm: Sequence[float]) -> Readings:
         self.steps += 1
         self.pwm = pwm
-        return [SensorSample(self.steps, slot, value, *(0.0,) * 13) for slot, value in enumerate(pwm)]
+        samples = [SensorSample(self.steps, slot, value, *(0.0,) * 13) for slot, value in enumerate(pwm)]
+        return Readings.of(samples)
 
 
 @pytest.fixture
@@ -278,8 +279,8 @@ def test_an_agent_with_a_pwm_out_of_range_is_dropped_and_nothing_of_it_applied(p
     world = EchoWorld(["A"])
     applied: list[float] = []
     events: list[str] = []
-    step = world.step
-    world.step = lambda pwm: (applied.extend(pwm), step(pwm))[1]  # type: ignore[method-assign]
+    step = world.exchange
+    world.exchange = lambda pwm: (applied.extend(pwm), step(pwm))[1]  # type: ignore[method-assign]
     with running(BusServer(path, world, report=events.append)):
         client = BusClient(path, ["A"], LIMIT_S)
         client.exchange([0.25])
@@ -397,13 +398,13 @@ def test_the_pace_is_the_asked_speed_and_no_tick_is_early(path) -> None:
 
 def test_a_world_that_is_too_slow_slips_and_says_by_how_much(path) -> None:
     world = EchoWorld(["A"])
-    step = world.step
+    step = world.exchange
 
-    def slow(pwm: Sequence[float]) -> list[SensorSample]:
+    def slow(pwm: Sequence[float]) -> Readings:
         time.sleep(0.01)
         return step(pwm)
 
-    world.step = slow  # type: ignore[method-assign]
+    world.exchange = slow  # type: ignore[method-assign]
     report = BusServer(path, world).run(1.0, lambda: world.steps >= 20)
     # 19 steps of at least 10 ms each where 1 ms is due: before the last, all lag but 20 ms has been given up.
     assert report.slipped_s >= 19 * 0.009 - 0.020 - 1e-9
@@ -426,11 +427,13 @@ SAMPLES = st.builds(SensorSample, INT64, INT64, *(st.floats(allow_nan=False),) *
 @given(st.integers(0, 2**64 - 1), st.lists(SAMPLES, min_size=1, max_size=5))
 def test_samples_survive_the_wire_exactly(tick, samples) -> None:
     frames = TickFrames.of(len(samples))
-    packed = frames.pack_samples(tick, samples)
+    readings, read = Readings.of(samples), Readings(len(samples))
+    packed = frames.pack_samples(tick, readings, range(len(samples)))
     assert len(packed) == 8 + 136 * len(samples)
-    assert frames.unpack_samples(packed) == (tick, samples)
+    assert frames.unpack_samples(packed, read) == tick
+    assert list(read) == samples
     with pytest.raises(FrameError, match="bytes"):
-        frames.unpack_samples(packed + b"\0")
+        frames.unpack_samples(packed + b"\0", read)
 
 
 @settings(deadline=None)

@@ -22,7 +22,7 @@ def test_true_parameters_give_the_true_torque(name: str) -> None:
     start = np.array(world.plant.q_rad)
     for tick in range(2500):
         target = start + 0.4 * (np.sin(rate * tick / 1000.0 + phase) - np.sin(phase))
-        log.step(list(np.clip(3.0 * (target - world.plant.q_rad), -1.0, 1.0)))
+        log.exchange(list(np.clip(3.0 * (target - world.plant.q_rad), -1.0, 1.0)))
     world.close()
     motion = log.motion()
     filtered = filtered_motion(

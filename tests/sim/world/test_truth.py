@@ -87,7 +87,7 @@ def test_the_log_records_every_fourth_instant_of_the_true_motion(tmp_path: Path)
     log = TruthLog(world)
     q, samples = [], []
     for k in range(42):
-        samples.append(log.step([0.1, 0.2 * np.sin(0.1 * k), -0.1]))
+        samples.append(list(log.exchange([0.1, 0.2 * np.sin(0.1 * k), -0.1])))
         q.append(world.plant.q_rad)
     log.save(tmp_path / "truth.npz")
     motion = read_motion(tmp_path / "truth.npz")
