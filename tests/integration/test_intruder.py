@@ -110,7 +110,7 @@ def test_with_security_the_robot_identifies_itself_among_intruders(secured, prog
     listed = list_modules(programs, endpoint, folder)
     assert listed.returncode == 0, listed.stderr
     hostile = [
-        open_zenoh(ZenohConfig(mode="client", connect=(endpoint,), connect_timeout_s=5.0, credentials=known))
+        open_zenoh(ZenohConfig(mode="client", connect=(endpoint,), connect_timeout_s=60.0, credentials=known))
         for known in (
             host_credentials(folder, ROBOT, ["INTRUDER"]),
             load_credentials(folder, ROBOT, [OBSERVER]),
