@@ -6,6 +6,7 @@ COMMANDS = {
     "run": ("run.run", "Identify a simulated robot and score the result."),
     "launch": ("run.launch", "Run world, agents and coordinator with the live viewer."),
     "world": ("world.world", "Run the world of one robot for agents to attach to."),
+    "fleet": ("fleet.fleet", "Run several robots on Zenoh routers, and measure what they cost."),
     "compile": ("compile.compile_kernels", "Compile all kernels, so that the first run does not."),
     "robots": ("robots.robots", "List the robots that are shipped."),
     "show": ("robots.show", "Draw a robot at its zero position."),

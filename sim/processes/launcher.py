@@ -164,20 +164,9 @@ class Launcher:
 
     def _start(self, name: str, arguments: Sequence[str], quiet: bool = True, up: str = "") -> Child:
         log = self._log(name) if quiet else None
-        with open(log if log is not None else os.devnull, "wb") as output:
-            # Its own session: Ctrl-C reaches the launcher alone, which then stops the others in order.
-            process = subprocess.Popen(
-                [*self.config.within(name), sys.executable, "-m", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output if quiet else None,
-                stderr=subprocess.STDOUT if quiet else None,
-                start_new_session=True,
-                preexec_fn=_die_with_parent,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-            )
-        child = Child(name, process, log, up)
+        child = start_child(name, arguments, log, self.config.within(name), up)
         self.children.append(child)
-        self._report(f"{name}: process {process.pid}")
+        self._report(f"{name}: process {child.process.pid}")
         return child
 
     def _wait(self, ready: Callable[[], bool], child: Child, what: str) -> None:
@@ -225,6 +214,24 @@ class Launcher:
             stop_child(child)
         self.children.clear()
         self._folder.cleanup()
+
+
+def start_child(
+    name: str, arguments: Sequence[str], log: Path | None, within: Sequence[str] = (), up: str = ""
+) -> Child:
+    """Start `python -m arguments`; its output goes to the log, or to this terminal without one."""
+    with open(log if log is not None else os.devnull, "wb") as output:
+        # Its own session: Ctrl-C reaches the launcher alone, which then stops the others in order.
+        process = subprocess.Popen(
+            [*within, sys.executable, "-m", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output if log is not None else None,
+            stderr=subprocess.STDOUT if log is not None else None,
+            start_new_session=True,
+            preexec_fn=_die_with_parent,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )
+    return Child(name, process, log, up)
 
 
 def stop_child(child: Child) -> None:
