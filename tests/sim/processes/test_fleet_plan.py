@@ -1,0 +1,90 @@
+"""Which processes a fleet has, how its routers hang together, and what its table says."""
+
+from pathlib import Path
+
+import pytest
+
+from module_agent.model.errors import UsageError
+from sim.processes.fleet_figures import (
+    FleetFigures,
+    KindFigures,
+    Reading,
+    missed,
+    of_kind,
+    summary,
+    table_rows,
+)
+from sim.processes.fleet_plan import plan_fleet, robot_file, router_tree
+from sim.robot.robot_file import parse_robot
+
+
+def test_routers_are_a_tree_of_two_branches() -> None:
+    parents = [router.parent for router in router_tree(("a", "b", "c", "d", "e", "f"))]
+    assert parents == [None, "a", "a", "b", "b", "c"]
+
+
+def test_robots_are_shared_out_among_the_leaves_and_coordinators_connect_to_the_root() -> None:
+    plan = plan_fleet(4, 16, ("a", "b", "c"), None)
+    assert plan.root == "a"
+    assert [robot.router for robot in plan.robots] == ["b", "c", "b", "c"]
+    assert [robot.processes for robot in plan.robots] == [2] * 4
+    assert plan.module_count == 64
+    assert len({serial for robot in plan.robots for serial in robot.serials}) == 64
+
+
+def test_one_router_serves_all() -> None:
+    assert [robot.router for robot in plan_fleet(2, 2, ("a",), 2).robots] == ["a", "a"]
+
+
+def test_a_plan_that_cannot_be_is_refused_with_what_can() -> None:
+    with pytest.raises(UsageError, match="--modules 65: a robot has at most 64"):
+        plan_fleet(1, 65, ("a",), None)
+    with pytest.raises(UsageError, match="2 of them are for robots, but there are 1"):
+        plan_fleet(1, 2, ("a", "b", "c"), None)
+
+
+def test_a_planned_robot_is_a_chain() -> None:
+    planned = plan_fleet(1, 3, ("a",), None).robots[0]
+    robot = parse_robot(robot_file(planned), "planned")
+    assert robot.name == planned.name
+    assert robot.serials == planned.serials
+    assert [module.parent for module in robot.modules] == ["base", *planned.serials[:-1]]
+
+
+def test_a_kind_is_the_sum_of_its_processes_and_all_the_sum_of_the_kinds() -> None:
+    before, after = [Reading(1.0, 9.0, 1, 1)] * 2, [Reading(2.0, 10.0, 3, 4), Reading(4.0, 30.0, 5, 6)]
+    kind = of_kind(before, after, 10.0)
+    assert kind == KindFigures(2, 40.0, 40.0, 8, 10)
+    figures = _figures(kinds={"agent": kind, "world": kind})
+    assert table_rows(figures) == [
+        ("agent", "2", "40", "40", "8", "10"),
+        ("world", "2", "40", "40", "8", "10"),
+        ("all", "4", "80", "80", "16", "20"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("measured", "words"),
+    [
+        ((1.0, 1.0, 0, 0), []),
+        ((0.5, 0.5, 0, 0), []),
+        ((0.8, 1.0, 0, 0), ["CPU: 0.80 times real time where 1 were asked for"]),
+        ((0.8, 1.0, 5, 0), ["CPU: 0.80 times real time where 1 were asked for", "network: 5 rows lost"]),
+        ((1.0, 1.0, 0, 2), ["network: 2 requests unanswered"]),
+    ],
+)
+def test_what_did_not_hold_is_named(measured: tuple[float, float, int, int], words: list[str]) -> None:
+    assert missed(*measured) == words
+
+
+def test_the_summary_says_what_broke_first() -> None:
+    assert summary(_figures()).endswith("broke first: nothing")
+    assert summary(_figures(broke=("network: 5 rows lost", "other"))).endswith("first: network: 5 rows lost")
+
+
+def test_lines_of_the_summary_stay_short(tmp_path: Path) -> None:
+    assert max(map(len, summary(_figures()).splitlines())) <= 110
+
+
+def _figures(kinds: dict[str, KindFigures] | None = None, broke: tuple[str, ...] = ()) -> FleetFigures:
+    return FleetFigures(2, 4, 1, 10.0, 1.0, 1.0, 2000.0, 0, 0, 1.0, 2.0, 40.0, kinds or {}, broke)
