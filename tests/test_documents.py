@@ -82,7 +82,7 @@ def environment() -> dict[str, str]:
 
 @pytest.mark.integration
 @pytest.mark.xdist_group("integration")
-@pytest.mark.parametrize("page", ["guide.md", "benchmarks.md", "security.md"])
+@pytest.mark.parametrize("page", ["guide.md", "benchmarks.md", "security.md", "scale.md"])
 def test_all_commands_of_a_page_succeed_one_after_the_other(
     page: str, tmp_path: Path, background: "list[subprocess.Popen[bytes]]"
 ) -> None:
@@ -136,7 +136,7 @@ def check_promised_files(run: Path) -> None:
 def test_every_shell_block_is_run() -> None:
     """Blocks of other pages hold only `make` commands, which take minutes: CI runs each of them as it is."""
     ci = (ROOT / ".ci" / "run").read_text()
-    for page in PAGES.keys() - {"guide.md", "benchmarks.md", "security.md"}:
+    for page in PAGES.keys() - {"guide.md", "benchmarks.md", "security.md", "scale.md"}:
         for line in (line for block in blocks("sh", page) for line in commands(block)):
             assert re.search(rf"^{line}$", ci, flags=re.MULTILINE), f"{page}: CI does not run `{line}`"
 

@@ -78,7 +78,8 @@ async def _listen(arm: LiveRobot, seconds: float) -> Heard:
     while time.monotonic() < start_s + seconds:
         # One after the other: all at once would measure how they queue here.
         for serial in logs:
-            await ask(serial)
+            if time.monotonic() < start_s + seconds:
+                await ask(serial)
         await asyncio.sleep(ASK_EVERY_S)
     spent_s = time.monotonic() - start_s
     ranges = [(log, first[serial], log.end_row) for serial, log in logs.items()]
