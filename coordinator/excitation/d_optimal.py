@@ -16,7 +16,7 @@ from coordinator.excitation.segment import SampledMotion, Segment, draw_segment,
 from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m
 from coordinator.parameter_fit.spectrum import MAX_SIGMA_KG
 from module_agent.model.chain import Array, Chain
-from module_agent.model.regressor import inverse_dynamics, torque_regressor
+from module_agent.model.regressor import gram_matrix, inverse_dynamics
 
 CANDIDATES = 150
 # Faster than the sines by ten: each period of the fastest is seen in a dozen samples.
@@ -114,10 +114,10 @@ def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | s
 
 def information(task: ExcitationTask, motion: SampledMotion) -> Array:
     """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `pseudo_inertia.parameter_scale`)."""
-    regressor = torque_regressor(task.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     scale = parameter_scale(len(task.limits))
-    rows = (regressor / task.torque_sigma_nm[:, None]).reshape(-1, scale.size) * scale
-    return np.asarray(rows.T @ rows)
+    weights = task.torque_sigma_nm**-2.0
+    gram = gram_matrix(task.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, weights)
+    return np.asarray(scale[:, None] * gram * scale)
 
 
 def _reason_against(task: ExcitationTask, segment: Segment) -> str:

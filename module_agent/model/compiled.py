@@ -17,9 +17,21 @@ def compiled(function: Function) -> Function:
 
     Other threads go on while it runs.
     """
+    return _kernel(function)
+
+
+def inlined(function: Function) -> Function:
+    """Compile a function as a part of the kernels that call it, where its arrays' strides may be constants.
+
+    Loops over arrays whose strides are constants become vector instructions.
+    """
+    return _kernel(function, inline=True)
+
+
+def _kernel(function: Function, inline: bool = False) -> Function:
     try:
-        kernel = numba.njit(cache=True, nogil=True)(function)
+        kernel = numba.njit(cache=True, nogil=True, forceinline=inline)(function)
     except RuntimeError:
         # No folder for the code (a read-only installation without a home): compiled in each process.
-        kernel = numba.njit(nogil=True)(function)
+        kernel = numba.njit(nogil=True, forceinline=inline)(function)
     return cast(Function, kernel)

@@ -16,12 +16,10 @@ from scipy.linalg import qr
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
-from module_agent.model.regressor import PER_BODY, torque_regressor
+from module_agent.model.regressor import PER_BODY, regressor_chunks, torque_regressor
 
 # Bounds the memory: a block of 64 joints is 0.7 GB at most, one of 7 joints 8 MB.
 _BLOCK = 2048
-# Of one joint alone: values in a block of the whole regressor, of which only that joint's are kept.
-_VALUES = 2_000_000
 
 
 class JointInformation(NamedTuple):
@@ -71,8 +69,14 @@ def gather(
     signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
     tau = np.asarray(tau_nm, dtype=float)
     parts = [slice(begin, begin + _BLOCK) for begin in range(0, max(tau.shape[0], 1), _BLOCK)]
-    blocks = (compress(torque_regressor(chain, *(s[part] for s in signals)), tau[part]) for part in parts)
-    return reduce(merge, blocks)
+    joints = len(chain.serials)
+    buffer = np.zeros((min(_BLOCK, len(signals[0])), joints, PER_BODY * joints))
+
+    def block(part: slice) -> tuple[JointInformation, ...]:
+        motion = [signal[part] for signal in signals]
+        return compress(torque_regressor(chain, *motion, out=buffer[: len(motion[0])]), tau[part])
+
+    return reduce(merge, map(block, parts))
 
 
 def gather_joint(
@@ -109,9 +113,10 @@ def gather_joint(
 
 
 def _own_rows(chain: Chain, joint: int, signals: Sequence[Array]) -> Array:
-    step = max(32, _VALUES // (PER_BODY * len(chain.serials) ** 2))
-    parts = (slice(start, start + step) for start in range(0, len(signals[0]), step))
-    return np.concatenate([torque_regressor(chain, *(s[part] for s in signals))[:, joint] for part in parts])
+    rows = np.empty((len(signals[0]), PER_BODY * len(chain.serials)))
+    for part, regressor in regressor_chunks(chain, *signals):
+        rows[part] = regressor[:, joint]
+    return rows
 
 
 def merge(one: Sequence[JointInformation], other: Sequence[JointInformation]) -> tuple[JointInformation, ...]:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ import typer
 
 from module_agent.model import compiled as kernels
 from module_agent.model.errors import RobotError
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 # Modules with kernels. A group is compiled in a process of its own.
 GROUPS = {
@@ -48,16 +51,22 @@ def compile_kernels() -> None:
 
 def compile_group(modules: tuple[str, ...]) -> None:
     """Compile the kernels of some modules; those of others, which a run calls in between, are interpreted."""
-    compiled = kernels.compiled
     # Kernels take the decorator from its module when theirs is imported, which is in `call_kernels`.
-    vars(kernels)["compiled"] = lambda f: compiled(f) if f.__module__ in modules else _interpreted(f)
+    for name, decorator in (("compiled", kernels.compiled), ("inlined", kernels.inlined)):
+        vars(kernels)[name] = partial(_of_group, modules, decorator)
     call_kernels()
+
+
+def _of_group(
+    modules: tuple[str, ...], decorator: Decorator, function: Callable[..., Any]
+) -> Callable[..., Any]:
+    return decorator(function) if function.__module__ in modules else _interpreted(function)
 
 
 def call_kernels() -> None:
     """Call every kernel with arguments of the types that a run has."""
     from module_agent.firmware.quiet_ticks import QuietTicks
-    from module_agent.model.regressor import torque_regressor
+    from module_agent.model.regressor import inverse_dynamics, torque_regressor
     from sim.robot.robot_file import load_robot
     from sim.robot.robot_tree import true_chain
     from sim.world.world import World
@@ -69,7 +78,9 @@ def call_kernels() -> None:
         readings = world.exchange(still[0].tolist())
     QuietTicks(len(readings)).run(readings, busy=[])
     world.close()
-    torque_regressor(true_chain(robot), still, still, still)
+    chain = true_chain(robot)
+    torque_regressor(chain, still, still, still)
+    inverse_dynamics(chain, np.ones(10 * len(robot.modules)), still, still, still)
 
 
 def _interpreted(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -112,7 +112,10 @@ def test_regressor_against_pinocchios_loop() -> None:
         anchor=loop,
     )
     report(f"{what} batch, a sample", found.batch_us, "us", anchor=loop)
+    report(f"{what} batch into new memory, a sample", found.array_us, "us", anchor=loop)
     report(f"{what} in chunks of {CHUNK}, a sample", found.chunks_us, "us", anchor=loop)
+    report(f"{what} streaming, a sample", found.stream_us, "us", at_most=5.0, anchor=loop)
+    report(f"inverse dynamics, {JOINTS} joints, a sample", found.torque_us, "us", anchor=loop)
     assert found.difference is not None
     report(f"{what} difference from pinocchio", found.difference, "relative", at_most=1e-12)
 

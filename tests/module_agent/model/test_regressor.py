@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import body_displacements
-from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regressor
+from module_agent.model.regressor import (
+    PER_BODY,
+    RegressorStream,
+    gram_matrix,
+    inverse_dynamics,
+    regressor_chunks,
+    torque_regressor,
+)
 
 # Pinocchio's order of a body's dynamic parameters: m, mc, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
 PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
@@ -89,14 +96,100 @@ def test_torques_equal_pinocchios_recursive_newton_euler(joints: int, seed: int)
     assert_close(inverse_dynamics(chain, phi, q, qd, qdd), expected, 1e-12)
 
 
-@pytest.mark.parametrize(("joints", "seed"), [(1, 0), (3, 1), (7, 2), (7, 3), (12, 4)])
-def test_the_matrix_equals_pinocchios_column_by_column(joints: int, seed: int) -> None:
+@settings(max_examples=40, deadline=None)
+@given(joints=st.integers(1, 12), seed=st.integers(0, 2**32 - 1), serial_chain=st.booleans())
+def test_the_matrix_equals_pinocchios_column_by_column(joints: int, seed: int, serial_chain: bool) -> None:
+    rng = default_rng(seed)
+    chain = random_chain(rng, joints, serial_chain=serial_chain)
+    # Whole groups of samples, and a remainder.
+    motion = random_motion(rng, 19, joints)
+    assert_equals_pinocchio(chain, torque_regressor(chain, *motion), *motion)
+
+
+@pytest.mark.parametrize("q_rad", [1e4, 9.9e4, 1.1e5, 1e9])
+def test_positions_many_turns_away_are_as_exact(rng: Generator, q_rad: float) -> None:
+    chain = random_chain(rng, 3)
+    q, qd, qdd = random_motion(rng, 5, 3)
+    q[1] += q_rad
+    q[3, 1] -= q_rad
+    assert_equals_pinocchio(chain, torque_regressor(chain, q, qd, qdd), q, qd, qdd)
+
+
+@settings(max_examples=30, deadline=None)
+@given(joints=st.integers(1, 9), samples=st.integers(1, 40), seed=st.integers(0, 2**32 - 1))
+def test_a_sample_has_the_same_bits_wherever_it_is_calculated(joints: int, samples: int, seed: int) -> None:
     rng = default_rng(seed)
     chain = random_chain(rng, joints)
+    motion = random_motion(rng, samples, joints)
+    whole = torque_regressor(chain, *motion)
+    stream = RegressorStream(chain)
+    for k in range(samples):
+        assert (stream.rows(*(signal[k] for signal in motion)) == whole[k]).all()
+        assert (torque_regressor(chain, *(signal[k : k + 3] for signal in motion)) == whole[k : k + 3]).all()
+    assert (torque_regressor(chain, *motion, threads=3) == whole).all()
+    for part, rows in regressor_chunks(chain, *motion):
+        assert (rows == whole[part]).all()
+
+
+def test_chunks_of_a_long_motion_follow_on_one_another_in_the_same_memory(rng: Generator) -> None:
+    chain = random_chain(rng, 7)
+    motion = random_motion(rng, 700, 7)
+    whole = torque_regressor(chain, *motion)
+    ends, places = [0], set()
+    for part, rows in regressor_chunks(chain, *motion):
+        assert part.start == ends[-1]
+        ends.append(part.stop)
+        places.add(rows.__array_interface__["data"][0])
+        assert not rows.flags.writeable
+        assert (rows == whole[part]).all()
+    assert ends[-1] == 700
+    assert len(ends) > 2
+    assert len(places) == 1
+
+
+def test_results_are_written_where_the_caller_wants_them(rng: Generator) -> None:
+    chain = random_chain(rng, 4)
+    motion = random_motion(rng, 33, 4)
+    out = np.zeros((50, 4, 40))
+    torque_regressor(chain, *random_motion(rng, 50, 4), out=out)
+    again = torque_regressor(chain, *motion, out=out[:33])
+    assert np.shares_memory(again, out)
+    assert not again.flags.writeable
+    assert out.flags.writeable
+    assert (again == torque_regressor(chain, *motion)).all()
+
+
+def test_an_array_that_cannot_take_the_result_is_refused(rng: Generator) -> None:
+    chain = random_chain(rng, 3)
+    motion = random_motion(rng, 4, 3)
+    with pytest.raises(
+        ValueError, match=r"out is float64 \(4, 3, 20\); this motion needs float64 \(4, 3, 30\)"
+    ):
+        torque_regressor(chain, *motion, out=np.zeros((4, 3, 20)))
+    with pytest.raises(ValueError, match="out is float32"):
+        torque_regressor(chain, *motion, out=np.zeros((4, 3, 30), dtype=np.float32))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not contiguous"):
+        torque_regressor(chain, *motion, out=np.zeros((4, 3, 60))[..., ::2])
+    fixed = np.zeros((4, 3, 30))
+    fixed.flags.writeable = False
+    with pytest.raises(ValueError, match="cannot be written to"):
+        torque_regressor(chain, *motion, out=fixed)
+    with pytest.raises(ValueError, match="out is not zero where a joint does not carry a body"):
+        torque_regressor(chain, *motion, out=np.ones((4, 3, 30)))
+
+
+def test_the_gram_matrix_is_that_of_the_weighted_rows(rng: Generator) -> None:
+    chain = random_chain(rng, 7)
+    motion = random_motion(rng, 600, 7)
+    weights = rng.uniform(0.1, 2.0, 7)
+    rows = (torque_regressor(chain, *motion) * np.sqrt(weights)[:, None]).reshape(-1, 70)
+    assert_close(gram_matrix(chain, *motion, weights), rows.T @ rows, 1e-12)
+
+
+def assert_equals_pinocchio(chain: Chain, ours: Array, q: Array, qd: Array, qdd: Array) -> None:
     model = pinocchio_model(chain)
     data = model.createData()
-    q, qd, qdd = random_motion(rng, 10, joints)
-    ours = torque_regressor(chain, q, qd, qdd)
+    joints = len(chain.serials)
     to_joint = [_shift(point) for point in chain.point]
     for k in range(q.shape[0]):
         theirs = np.atleast_2d(
@@ -200,14 +293,16 @@ def test_an_arm_held_out_level_needs_mass_times_gravity_times_reach() -> None:
     assert inverse_dynamics(chain, phi, up, still, np.full((1, 1), 3.0)) == pytest.approx(0.5 * 3.0)
 
 
-def test_blocks_of_samples_leave_no_seam(rng: Generator) -> None:
-    chain = random_chain(rng, 3)
-    phi, _ = random_bodies(rng, chain)
-    motion = random_motion(rng, 2100, 3)
-    whole = torque_regressor(chain, *motion)
-    alone = torque_regressor(chain, *(signal[1022:1026] for signal in motion))
-    np.testing.assert_allclose(whole[1022:1026], alone, rtol=0, atol=1e-12 * np.abs(alone).max())
-    np.testing.assert_allclose(inverse_dynamics(chain, phi, *motion), whole @ phi, atol=1e-10)
+@settings(max_examples=30, deadline=None)
+@given(joints=st.integers(1, 9), seed=st.integers(0, 2**32 - 1))
+def test_the_torques_are_the_regressor_times_any_parameters(joints: int, seed: int) -> None:
+    rng = default_rng(seed)
+    chain = random_chain(rng, joints)
+    phi = rng.normal(size=10 * joints)
+    motion = random_motion(rng, 21, joints)
+    rows = torque_regressor(chain, *motion)
+    size = np.abs(rows) @ np.abs(phi)
+    assert (np.abs(inverse_dynamics(chain, phi, *motion) - rows @ phi) <= 1e-12 * size.max()).all()
 
 
 def test_results_cannot_be_written_to(rng: Generator) -> None:

@@ -109,7 +109,7 @@ GOOD: Mapping[str, Callable[[Trial], Any]] = {
     "topology_trial": lambda _: TopologyTrial(0, 5, (), 0.999, 0, 30.0),
     "checks_of_one_robot": _checked,
     "fault_trial": lambda _: FaultTrial(False, (), (0.5, 0.5), ""),
-    "regressor_trial": lambda _: RegressorTrial(1.0, 1.0, 4.0, 1e-15),
+    "regressor_trial": lambda _: RegressorTrial(0.3, 0.6, 1.0, 3.0, 0.3, 4.0, 1e-15),
     "inertia_trial": _weighed,
     "reassembly_in_folder": lambda _: Reassembly(60, (15,) * 3, 29, 0.7, (0.7,) * 3, 1e-15, (1.0,) * 3),
     "payload_trial": lambda trial: PayloadTrial("", 0, trial.arguments[4], True, 0.001, 2e-4, 11.0),

@@ -114,8 +114,8 @@ def test_a_payload_on_another_body_or_of_another_mass_misses() -> None:
 
 def test_without_pinocchio_only_our_own_cost_is_judged() -> None:
     (name,) = (name for name in CASES if name.startswith("regressor"))
-    assert len(rows(name, RegressorTrial(1.0, 1.0, None, None))) == 1
-    assert missed(rows(name, RegressorTrial(2.0, 21.0, 3.0, 1e-8))) == [
+    assert len(rows(name, RegressorTrial(0.3, 0.6, 1.0, 3.0, 0.3, None, None))) == 1
+    assert missed(rows(name, RegressorTrial(0.8, 1.0, 21.0, 3.0, 0.3, 3.0, 1e-11))) == [
         "in chunks of 50 [us a sample]",
         "difference from pinocchio's [relative]",
         "cost of a batch over pinocchio's loop",
