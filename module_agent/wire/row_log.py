@@ -3,6 +3,8 @@
 Rows are numbered since the module's boot, so that a listener knows which are missing and can request them.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,15 @@ _GROWTH = 4096
 MAX_ROWS = 4_000_000
 
 
+class _Index(NamedTuple):
+    """Where rows have arrived, and their module times, as of a number of changes."""
+
+    changes: int
+    arrived: NDArray[np.intp]
+    t_ns: NDArray[np.int64]
+    ascending: bool
+
+
 class RowLog:
     """Rows of one boot of one module, by row number."""
 
@@ -24,6 +35,9 @@ class RowLog:
         self._end = 0
         self._rows = np.zeros(0, dtype=ROW)
         self._have = np.zeros(0, dtype=bool)
+        # Counts changes of the rows; other threads read while rows arrive.
+        self._changes = 0
+        self._index = _Index(-1, np.zeros(0, np.intp), np.zeros(0, np.int64), True)
 
     def copied(self) -> "RowLog":
         """Return a log with the rows so far, to which later rows are not added."""
@@ -61,6 +75,7 @@ class RowLog:
         self._rows[span] = rows
         self._have[span] = True
         self._end = max(self._end, end)
+        self._changes += 1
         return rows
 
     def _reserve(self, first: int, end: int, base: int) -> None:
@@ -105,9 +120,19 @@ class RowLog:
         return self.first_row + int(within[0]), self.first_row + int(within[-1]) + 1
 
     def _within(self, start_ns: int, end_ns: int) -> NDArray[np.intp]:
-        arrived = np.flatnonzero(self._have)
-        t_ns = self._rows["t_ns"][arrived]
-        return arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]
+        index = self._times()
+        if index.ascending:
+            return index.arrived[slice(*np.searchsorted(index.t_ns, [start_ns, end_ns + 1]))]
+        return index.arrived[(index.t_ns >= start_ns) & (index.t_ns <= end_ns)]
+
+    def _times(self) -> "_Index":
+        """Return where rows have arrived and their times; searched for again when more have."""
+        changes, index = self._changes, self._index
+        if index.changes != changes:
+            arrived = np.flatnonzero(self._have)
+            t_ns = self._rows["t_ns"][arrived].astype(np.int64)
+            self._index = index = _Index(changes, arrived, t_ns, bool((np.diff(t_ns) >= 0).all()))
+        return index
 
     def forget_before(self, row: int) -> None:
         """Drop rows below `row`, for listeners with little memory."""
@@ -116,3 +141,4 @@ class RowLog:
         cut = min(row - self._base, len(self._have))
         self._rows, self._have = self._rows[cut:].copy(), self._have[cut:].copy()
         self._base += cut
+        self._changes += 1

@@ -66,3 +66,17 @@ def test_a_row_that_is_impossibly_far_off_is_refused_before_memory_is_taken_for_
     with pytest.raises(WireError, match="too far"):
         log.add(block(10_000_000_000, 5))
     assert log.end_row == 5
+
+
+def test_rows_that_arrive_after_a_look_are_in_the_next_one() -> None:
+    log = RowLog(1)
+    log.add(block(0, 10))
+    assert len(log.between(0, 10**12)) == 10
+    log.add(block(20, 10))
+    assert len(log.between(0, 10**12)) == 20
+    log.forget_before(25)
+    assert len(log.between(0, 10**12)) == 5
+    # Another log does not share what was looked up.
+    other = log.copied()
+    other.add(block(40, 10))
+    assert (len(log.between(0, 10**12)), len(other.between(0, 10**12))) == (5, 15)
