@@ -15,6 +15,7 @@ COMMANDS = {
     "benchmark": ("benchmark.app", "Measure the whole system against its bars."),
     "thesis": ("thesis.thesis", "Repeat the thesis' experiments and compare with what it printed."),
     "monitoring": ("monitoring.monitoring", "Count what the monitor finds, and its false alarms."),
+    "faults": ("faults.faults", "Search for faults that the system does not survive."),
     "compare-log": ("compare_log.compare_log", "Compare a real module's log with the simulated module."),
 }
 

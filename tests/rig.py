@@ -15,8 +15,8 @@ from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Recording
 from coordinator.session.run import Run, RunConfig
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
-from module_agent.transport.transport import Event, Reply, Request, Sample, Transport, Undeclare
 from sim.robot.robot_file import load_robot
+from sim.virtual_time.cable import Cable, CableState
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.network import VirtualNetwork
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
@@ -39,49 +39,6 @@ class Notes:
         self.lines.append(text)
 
 
-class _Cuttable:
-    """A transport whose endpoint can be cut off the network and joined again, as by pulling its cable."""
-
-    def __init__(self, rig: "Rig", inner: Transport):
-        self._rig = rig
-        self._inner = inner
-
-    def publish(self, key: str, payload: bytes) -> None:
-        if not self._rig.cut:
-            self._inner.publish(key, payload)
-
-    def subscribe(self, key_expr: str, sink: Callable[[Event], None]) -> Undeclare:
-        return self._inner.subscribe(key_expr, self._filtered(sink))
-
-    def serve(self, key_expr: str, sink: Callable[[Event], None]) -> Undeclare:
-        return self._inner.serve(key_expr, self._filtered(sink))
-
-    def query(
-        self, key: str, payload: bytes, timeout_s: float, sink: Callable[[Event], None], tag: int
-    ) -> None:
-        if self._rig.cut:
-            lost = Reply(tag, key, None, "Timeout")
-            self._rig.loop.call_later(timeout_s, sink, lost)
-        else:
-            self._inner.query(key, payload, timeout_s, sink, tag)
-
-    def declare_alive(self, key: str) -> Undeclare:
-        return self._inner.declare_alive(key)
-
-    def watch_alive(self, key_expr: str, sink: Callable[[Event], None]) -> Undeclare:
-        return self._inner.watch_alive(key_expr, sink)
-
-    def close(self) -> None:
-        self._inner.close()
-
-    def _filtered(self, sink: Callable[[Event], None]) -> Callable[[Event], None]:
-        def pass_on(event: Event) -> None:
-            if not (self._rig.cut and isinstance(event, Sample | Request)):
-                sink(event)
-
-        return pass_on
-
-
 class Rig(VirtualRobot):
     """World, network and agents of one robot that ticks from the start; `cut` severs the coordinator from it.
 
@@ -99,7 +56,7 @@ class Rig(VirtualRobot):
         **firmware: Any,
     ):
         self._guest = beside is not None
-        self.cut = False
+        self.cable = CableState()
         loop = VirtualLoop() if beside is None else beside.loop
         shared = VirtualNetwork(loop, tap) if beside is None else beside.network
         impaired = PROFILES[network] if isinstance(network, str) else network
@@ -109,6 +66,14 @@ class Rig(VirtualRobot):
     def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
         """Boot ids in order, so that those of a restarted module are known and tell rigs apart."""
         return np.random.SeedSequence(settings.seed), itertools.count(101 + 1000 * settings.seed)
+
+    @property
+    def cut(self) -> bool:
+        return self.cable.cut
+
+    @cut.setter
+    def cut(self, cut: bool) -> None:
+        self.cable.cut = cut
 
     def state(self, serial: str) -> str:
         return self.hosts[serial].modules[0].firmware.state
@@ -137,7 +102,7 @@ class Rig(VirtualRobot):
         def clock() -> int:
             return loop.now_ns
 
-        way = _Cuttable(self, self.endpoint(sender))
+        way = Cable(self.endpoint(sender), self.loop, self.cable)
         messenger = Messenger(way, self.robot.name, clock, loop.call_soon, recording.accept)
         messenger.start()
         return messenger, recording, ModuleGroup(messenger, recording, clock, Sender(sender, SECRET))
@@ -170,7 +135,7 @@ class Rig(VirtualRobot):
         )
         run = Run(
             config,
-            _Cuttable(self, self.endpoint(sender)),
+            Cable(self.endpoint(sender), self.loop, self.cable),
             lambda: self.loop.now_ns,
             self.loop.call_soon,
             notes,

@@ -1,0 +1,1 @@
+"""Deterministic simulation of faults, judged by the truth of the plant."""
