@@ -41,6 +41,8 @@ PLAN = Plan(
 LIMIT_S = 180.0
 # How long motors are observed after the coordinator has ended: several lifetimes.
 AFTERWARDS_S = 1.0
+# By how much messages are delayed.
+DELAY_S = 0.1
 # When a coordinator that was killed is started again, its lease of the modules has lapsed.
 RESTART_S = 2.0
 
@@ -104,6 +106,7 @@ class _Session:
         self._robot = robot
         self._out = out
         self._cable = CableState()
+        self._disturbances: list[Fault] = []
         self._sender = COORDINATOR
         self._restarts = False
         self._over = False
@@ -216,17 +219,20 @@ class _Session:
         self._kill(fault)
 
     def _disturb(self, fault: Fault) -> None:
-        cable = self._cable
-        if fault.kind == "partition":
-            cable.cut = True
-        elif fault.kind == "corrupted messages":
-            cable.flip = fault.byte
-        elif fault.kind == "duplicated messages":
-            cable.copies = 1
-        else:
-            cable.delay_s = 0.1
+        self._disturbances.append(fault)
+        self._set_cable()
 
         def mend() -> None:
-            cable.cut, cable.flip, cable.copies, cable.delay_s = False, None, 0, 0.0
+            self._disturbances.remove(fault)
+            self._set_cable()
 
         self._later(fault, mend)
+
+    def _set_cable(self) -> None:
+        """Let the cable do what all disturbances that go on together make of it."""
+        present, cable = {fault.kind: fault for fault in self._disturbances}, self._cable
+        corrupted = present.get("corrupted messages")
+        cable.cut = "partition" in present
+        cable.flip = None if corrupted is None else corrupted.byte
+        cable.copies = int("duplicated messages" in present)
+        cable.delay_s = DELAY_S if "delayed messages" in present else 0.0

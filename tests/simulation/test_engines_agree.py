@@ -7,10 +7,10 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify_kinematics
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.network_emulation.profile import PROFILES
-from sim.physics.engine import Physics
+from sim.physics.engine import CompiledEngine, Physics
 from sim.robot.robot_file import load_robot
 from sim.scoring.gauge_alignment import tip_error
-from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
 
 # The engines differ by rounding, which the resolution of encoders and IMUs mostly hides. With play in the
@@ -20,7 +20,11 @@ SAME_M = 1e-6
 
 def identified(physics: Physics, noise: str, plan: Plan) -> ChainEstimate:
     settings = VirtualSettings(load_robot("a2085_03"), PROFILES["lan"], 4, noise, physics=physics)
-    return identify_kinematics(record_session(settings, plan)).fit
+
+    def moved_by_it(robot: VirtualRobot) -> None:
+        assert isinstance(robot.world._body, CompiledEngine) == (physics == "compiled")
+
+    return identify_kinematics(record_session(settings, plan, moved_by_it)).fit
 
 
 @pytest.mark.parametrize("noise", ["ideal", "x5"])
