@@ -1,55 +1,20 @@
-"""Geometry of a drawn chain: poses of housings, outputs, links and axes.
-
-Everything is in the root frame at q = 0 and is grouped by the body that carries it, so that a body's
-displacement D_i(q) (`forward_kinematics.body_displacements`) moves all of it.
+"""How a chain is drawn: its modules by the types' names, upright, its trees apart.
 
 The trees of a chain of several are drawn apart, because their relative pose is not known.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coordinator.description.module_geometry import Module, from_z, links, placed_modules
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import apply_perturbation
 
 # Distance between the trees of a chain.
 GAP_M = 0.25
-
-
-class Module(NamedTuple):
-    """Geometry of one module of a chain.
-
-    housing_body, output_body: the bodies that carry the housing and the output, `BASE` for the base.
-    housing: (4, 4) pose of the housing frame.
-    box_size, box_centre: (3,) edges and centre of the housing's outline, in its own frame [m].
-    output: (3,) the point of the identified axis nearest to where the output is in the housing.
-    axis: (3,) unit vector of the joint's axis.
-    """
-
-    housing_body: int
-    output_body: int
-    housing: Array
-    box_size: Array
-    box_centre: Array
-    output: Array
-    axis: Array
-
-
-class Link(NamedTuple):
-    """A straight line from `start` (3,) to `end` (3,) between two modules, carried by `body`."""
-
-    body: int
-    start: Array
-    end: Array
-
-    @property
-    def length_m(self) -> float:
-        """Its length [m]."""
-        return float(np.linalg.norm(self.end - self.start))
 
 
 def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
@@ -62,48 +27,11 @@ def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
     Raises:
         KeyError: a serial of the chain is not in `types`, or its type is not in the catalogue.
     """
-    placed = []
-    for k, serial in enumerate(chain.serials):
+    for serial in chain.serials:
         if serial not in types:
             known = ", ".join(types) or "none"
             raise KeyError(f"the type of module {serial!r} is not known; known are {known}")
-        made = module_type(types[serial])
-        housing = chain.imu_home[k].copy()
-        housing[:3, 3] -= housing[:3, :3] @ made.imu_xyz
-        corners = np.array([made.housing_min_xyz, made.housing_max_xyz])
-        nominal = housing[:3, :3] @ made.output_xyz + housing[:3, 3]
-        axis, point = chain.axis[k], chain.point[k]
-        placed.append(
-            Module(
-                housing_body=chain.carrier(k),
-                output_body=chain.parent[k] if chain.reversed[k] else k,
-                housing=housing,
-                box_size=corners[1] - corners[0],
-                box_centre=corners.mean(axis=0),
-                output=point + axis * float(axis @ (nominal - point)),
-                axis=axis,
-            )
-        )
-    return tuple(placed)
-
-
-def links(chain: Chain, placed: tuple[Module, ...]) -> tuple[Link, ...]:
-    """Return the link of each module to its parent, or to the origin of the base for a root module.
-
-    A link runs from the parent's distal side (its output, or its housing if reversed) to the child's proximal
-    side (its housing, or its output if reversed).
-    """
-    joined = []
-    for k, parent in enumerate(chain.parent):
-        child = placed[k]
-        end = child.output if chain.reversed[k] else child.housing[:3, 3]
-        if parent == BASE:
-            start = np.zeros(3)
-        else:
-            above = placed[parent]
-            start = above.housing[:3, 3] if chain.reversed[parent] else above.output
-        joined.append(Link(parent, start, end))
-    return tuple(joined)
+    return placed_modules(chain, [module_type(types[serial]) for serial in chain.serials])
 
 
 def upright(gravity: Array) -> Rotation:
@@ -118,16 +46,6 @@ def upright(gravity: Array) -> Rotation:
     if not np.isfinite(length) or length < 1e-6:
         raise ValueError(f"gravity {gravity} has no direction, so the robot cannot be set upright")
     return from_z(gravity / length).inv()
-
-
-def from_z(direction: Array) -> Rotation:
-    """Return the smallest rotation that turns +z into the unit vector `direction` (3,)."""
-    axis = np.cross([0.0, 0.0, 1.0], direction)
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, direction[2]))
-    # Along z the axis is not defined; any horizontal one serves for the half turn.
-    unit = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
-    return Rotation.from_rotvec(angle * unit)
 
 
 def reach_m(chain: Chain, placed: tuple[Module, ...]) -> float:

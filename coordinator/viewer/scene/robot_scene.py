@@ -7,9 +7,10 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
+from coordinator.description.module_geometry import Link, Module, from_z, links
 from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS
-from coordinator.viewer.scene.robot_geometry import Link, Module, from_z, links, modules, upright
+from coordinator.viewer.scene.robot_geometry import modules, upright
 from coordinator.viewer.scene.time_series import IntArray, time_column
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.forward_kinematics import body_displacements

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coordinator.description.module_geometry import from_z, links
 from coordinator.viewer.scene import robot_scene
-from coordinator.viewer.scene.robot_geometry import from_z, links, modules, reach_m, side_by_side, upright
+from coordinator.viewer.scene.robot_geometry import modules, reach_m, side_by_side, upright
 from coordinator.viewer.scene.topology_graph import as_topology, extent, positions
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import body_displacements, imu_poses
