@@ -264,7 +264,7 @@ def export_urdf(robot: SavedRun | Identified, path: Path | str) -> None:
     """
     chain, phi, types, name = _described(robot)
     kinds = [module_type(types[s]) for s in chain.serials]
-    write_urdf(Path(path), chain, phi, name, kinds, _undetermined(robot))
+    write_urdf(Path(path), chain, phi, name, kinds, _undetermined(robot), robot.result.unknown_links)
 
 
 def export_hrdf(robot: SavedRun | Identified, path: Path | str) -> None:

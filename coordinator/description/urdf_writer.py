@@ -1,8 +1,13 @@
-"""The identified robot as a URDF file: continuous joints, IMU frames, and inertias where they are known.
+"""The identified robot as a URDF file: joints, frames, shapes, and inertias where they are known.
 
 `world` has z up, so that the usual gravity (0, 0, -9.81) is right however the robot is mounted; `base` is the
 root frame. Body i is the link `body_<serial>` with z on its joint's axis at q = 0 and turns by
-`joint_<serial>`; `imu_<serial>` is a link fixed to the body that carries the IMU.
+`joint_<serial>`. Links without mass are frames: `imu_<serial>` on the body that carries the IMU and, where
+the module types are given, `housing_<serial>` and `output_<serial>` as the catalogue has them, and
+`tip_<serial>` at the end of every branch, which is the moved face of the last module (HRDF's end effector).
+
+Shapes are for drawing and for planners: a box for every housing, a cylinder for every link, both to see and
+to touch. What a link truly looks like is not identified.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from coordinator.description.module_geometry import Module, placed_modules
+from coordinator.description.module_geometry import links as links_between
 from coordinator.dynamics.pseudo_inertia import (
     Body,
     body,
@@ -22,6 +29,7 @@ from coordinator.dynamics.pseudo_inertia import (
     pseudo_inertia,
     smallest_eigenvalue,
 )
+from coordinator.kinematics.frames import distal_homes, housing_homes, output_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.files import replacing
@@ -30,6 +38,10 @@ from module_agent.model.regressor import PER_BODY, check_phi
 
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ALL_DETERMINED: Mapping[str, Sequence[str]] = MappingProxyType({})
+# Of a link whose shape is not identified: that of the kit's tubes.
+LINK_RADIUS_M = 0.016
+# Shorter links are faces that lie on each other.
+_MIN_LINK_M = 1e-3
 
 
 def write_urdf(
@@ -39,20 +51,23 @@ def write_urdf(
     name: str = "robot",
     module_types: Sequence[ModuleType] | None = None,
     undetermined: Mapping[str, Sequence[str]] = ALL_DETERMINED,
+    unknown: Mapping[str, Sequence[str]] = ALL_DETERMINED,
 ) -> None:
     """Write the robot of n joints; the file is the complete old or the complete new one.
 
     phi: (10 n,) inertial parameters as in `torque_regressor`, None to write no inertias. Parameters that are
     no real body's are replaced by the nearest real body (`nearest_consistent`), and a comment says so.
-    module_types: per joint; their effort and speed limits are written.
+    module_types: per joint; their limits and losses, frames and shapes are written.
     undetermined: by the serial, parameters of its body that torques alone do not determine; a comment in the
         link names them.
+    unknown: by the child's serial, parameters of the transform from its parent that take part in an
+        unobservable change (`link_transforms`); a comment in the joint names them.
 
     Raises:
         ValueError: `phi` or `module_types` do not fit the chain.
         OSError: the file cannot be written.
     """
-    write_xml(path, robot_element(chain, phi, name, module_types, undetermined))
+    write_xml(path, robot_element(chain, phi, name, module_types, undetermined, unknown))
 
 
 def robot_element(
@@ -61,6 +76,7 @@ def robot_element(
     name: str = "robot",
     module_types: Sequence[ModuleType] | None = None,
     undetermined: Mapping[str, Sequence[str]] = ALL_DETERMINED,
+    unknown: Mapping[str, Sequence[str]] = ALL_DETERMINED,
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_urdf`."""
     joints = len(chain.serials)
@@ -72,26 +88,81 @@ def robot_element(
     robot = Element("robot", name=name)
     comment(robot, "Joint positions are the modules' own; every frame is where it is at q = 0. SI units.")
     SubElement(robot, "link", name="world")
-    SubElement(robot, "link", name="base")
+    links = {BASE: SubElement(robot, "link", name="base")}
     _joint(robot, "world_to_base", "fixed", "world", "base", upright_pose(chain.gravity))
     for i, serial in enumerate(chain.serials):
-        link = SubElement(robot, "link", name=names[i])
+        links[i] = SubElement(robot, "link", name=names[i])
         if bodies is not None:
-            comment_undetermined(link, undetermined.get(serial, ()))
-            _inertial(link, bodies[i], homes[i])
+            comment_undetermined(links[i], undetermined.get(serial, ()))
+            _inertial(links[i], bodies[i], homes[i])
         parent = chain.parent[i]
         pose = _relative(homes, parent, homes[i])
         joint = _joint(robot, f"joint_{serial}", "continuous", names[parent], names[i], pose)
+        if unknown.get(serial):
+            comment(
+                joint,
+                f"Not determined by the run: {', '.join(unknown[serial])} of the link to this module "
+                "(see unresolved in result.json).",
+            )
         SubElement(joint, "axis", xyz="0 0 1")
         if module_types is not None:
-            effort, velocity = module_types[i].max_effort_nm, module_types[i].max_speed_rad_s
-            SubElement(joint, "limit", effort=numbers(effort), velocity=numbers(velocity))
-    for k, serial in enumerate(chain.serials):
-        on = chain.carrier(k)
-        SubElement(robot, "link", name=f"imu_{serial}")
-        pose = _relative(homes, on, chain.imu_home[k])
-        _joint(robot, f"imu_mount_{serial}", "fixed", names[on], f"imu_{serial}", pose)
+            _make_of_joint(joint, module_types[i])
+    frames = [("imu", k, chain.carrier(k), chain.imu_home[k]) for k in range(joints)]
+    if module_types is not None:
+        _add_shapes(links, homes, chain, placed_modules(chain, module_types))
+        frames += _module_frames(chain, module_types)
+    for kind, k, on, home in frames:
+        frame = f"{kind}_{chain.serials[k]}"
+        SubElement(robot, "link", name=frame)
+        mount = f"{kind}_mount_{chain.serials[k]}"
+        _joint(robot, mount, "fixed", names[on], frame, _relative(homes, on, home))
     return robot
+
+
+def _make_of_joint(joint: Element, made: ModuleType) -> None:
+    """Add the limits and losses of a module's type to its joint, which has ends if the type has."""
+    limit = {"effort": numbers(made.max_effort_nm), "velocity": numbers(made.max_speed_rad_s)}
+    if made.range_rad is not None:
+        joint.set("type", "revolute")
+        limit |= {"lower": numbers(made.range_rad[0]), "upper": numbers(made.range_rad[1])}
+    SubElement(joint, "limit", limit)
+    comment(joint, f"Losses of the {made.name} by its catalogue; they are not identified.")
+    motor = made.motor
+    SubElement(joint, "dynamics", damping=numbers(motor.viscous_nm_s_rad), friction=numbers(motor.coulomb_nm))
+
+
+def _module_frames(chain: Chain, types: Sequence[ModuleType]) -> list[tuple[str, int, int, Array]]:
+    """Return the frames of the modules: their kind, module, body that carries them, pose (4, 4) at q = 0."""
+    housing, output = housing_homes(chain, types), output_homes(chain, types)
+    distal, modules = distal_homes(chain, types), range(len(chain.serials))
+    return [
+        *(("housing", k, chain.carrier(k), housing[k]) for k in modules),
+        *(("output", k, chain.parent[k] if chain.reversed[k] else k, output[k]) for k in modules),
+        *(("tip", k, k, distal[k]) for k in chain.leaves),
+    ]
+
+
+def _add_shapes(bodies: Mapping[int, Element], homes: Array, chain: Chain, placed: Sequence[Module]) -> None:
+    """Add boxes of housings and cylinders of links to the links of the bodies that carry them."""
+    for serial, module, link in zip(chain.serials, placed, links_between(chain, placed), strict=True):
+        box = Element("box", size=numbers(module.box_size))
+        pose = module.housing.copy()
+        pose[:3, 3] += module.housing[:3, :3] @ module.box_centre
+        on = module.housing_body
+        _add_shape(bodies[on], f"housing_{serial}", _relative(homes, on, pose), box)
+        if link.body != BASE and link.length_m > _MIN_LINK_M:
+            pose = np.eye(4)
+            pose[:3, :3] = _shortest_turn(np.array([0.0, 0.0, 1.0]), (link.end - link.start) / link.length_m)
+            pose[:3, 3] = 0.5 * (link.start + link.end)
+            tube = Element("cylinder", radius=numbers(LINK_RADIUS_M), length=numbers(link.length_m))
+            _add_shape(bodies[link.body], f"link_{serial}", _relative(homes, link.body, pose), tube)
+
+
+def _add_shape(link: Element, name: str, pose: Array, shape: Element) -> None:
+    for use in ("visual", "collision"):
+        one = SubElement(link, use, name=f"{use}_{name}")
+        SubElement(one, "origin", _origin(pose))
+        SubElement(one, "geometry").append(shape)
 
 
 def link_homes(chain: Chain) -> Array:
@@ -128,11 +199,15 @@ def _joint(robot: Element, name: str, kind: str, parent: str, child: str, pose: 
     joint = SubElement(robot, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
+    SubElement(joint, "origin", _origin(pose))
+    return joint
+
+
+def _origin(pose: Array) -> dict[str, str]:
     # URDF turns about the fixed x, y and z in this order. At a pitch of 90 degrees roll and yaw are one
     # angle: any split of it is right, so the warning is suppressed.
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", suppress_warnings=True)
-    SubElement(joint, "origin", xyz=numbers(pose[:3, 3]), rpy=numbers(rpy))
-    return joint
+    return {"xyz": numbers(pose[:3, 3]), "rpy": numbers(rpy)}
 
 
 def _inertial(link: Element, phi: Array, home: Array) -> None:

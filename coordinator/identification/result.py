@@ -310,6 +310,15 @@ class Result(Part):
     trace_hash: str
     schema_version: int = Field(default=SCHEMA, alias="schema")
 
+    @property
+    def unknown_links(self) -> dict[str, tuple[str, ...]]:
+        """The parameters of every link with an unobservable part, by the child's serial; those with any."""
+        names = {
+            one.child: tuple(n for n, sigma in zip(one.parameters, one.sigma, strict=True) if sigma is None)
+            for one in self.transforms
+        }
+        return {child: parameters for child, parameters in names.items() if parameters}
+
     @model_validator(mode="before")
     @classmethod
     def _of_any_schema(cls, document: Any) -> Any:

@@ -411,7 +411,7 @@ def write_outputs(out: Path, identified: Identified) -> None:
         identified.result.dynamics,
     )
     undetermined = dynamics.undetermined if dynamics is not None else {}
-    write_urdf(out / URDF, chain, phi, name, types, undetermined)
+    write_urdf(out / URDF, chain, phi, name, types, undetermined, identified.result.unknown_links)
     write_hrdf(out / HRDF, chain, types, phi, name, undetermined)
     if identified.held_out is not None:
         write_held_out(out / HELD_OUT, identified.held_out)
