@@ -12,6 +12,10 @@ def screenshot(
     recording: Annotated[Path, typer.Argument(help="A session.rrd.")],
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
     tab: Annotated[str | None, typer.Option(help="Tab to show.")] = None,
+    at: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="SECONDS", help="Time of the session to show; by default its end."),
+    ] = None,
 ) -> None:
     """Render a recording as the viewer shows it, without a screen."""
-    picture(recording, out, tab)
+    picture(recording, out, tab, at_s=at)

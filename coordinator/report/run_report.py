@@ -24,7 +24,7 @@ from coordinator.report.document import (
     Section,
     Table,
 )
-from coordinator.report.pages import write_page
+from coordinator.report.pages import markdown_page, write_page
 from coordinator.report.plots import (
     Bar,
     check_plots,
@@ -80,6 +80,14 @@ def write_report(folder: Path, recording: Recording, result: Result | None) -> P
     path = folder / REPORT
     write_page(path, run_report(RunData(folder.resolve().name, recording, result, torques)))
     return path
+
+
+def result_markdown(result: Result) -> str:
+    """Return the tables of a result as Markdown: topology, links, axes, torques and what cannot be known."""
+    document = Document(
+        title=f"{result.robot}, as identified", sections=tuple(result_sections(result, held_out=None))
+    )
+    return markdown_page(document, folder="")[0]
 
 
 def read_held_out(path: Path) -> HeldOutTorques | None:

@@ -60,7 +60,7 @@ from coordinator.recording.run_folder import (
 )
 from coordinator.recording.session_file import SessionWriter, read_session
 from coordinator.report.plots import MissingPlots
-from coordinator.report.run_report import write_report
+from coordinator.report.run_report import result_markdown, write_report
 from coordinator.session.information_requests import InformationRequests
 from coordinator.session.session import Session
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
@@ -335,6 +335,7 @@ class Run:
             self._feed.chain(self._clock(), identified.kinematics.fit)
             if identified.held_out is not None:
                 self._feed.held_out(identified.held_out)
+            self._feed.result(self._clock(), result_markdown(identified.result))
             self._feed.step(self._clock(), "done")
             self._identified = identified
             for line in identified.inertia.summary() if identified.inertia is not None else ():

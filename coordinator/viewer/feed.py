@@ -207,7 +207,7 @@ class ViewerFeed:
             self._overlay.chain(self._viewer, now_ns, chain, fit.unresolved)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
         sigma = [s if np.isfinite(s) else 0.0 for s in fit.link_length_sigma_m.tolist()]
-        self._viewer.chain(now_ns, chain, sigma)
+        self._viewer.chain(now_ns, chain, sigma, fit.covariance)
         self._drawn = True
 
     def _show_links(self, session_ns: int, fit: ChainEstimate, shown: tuple[bool, ...]) -> None:
@@ -225,3 +225,7 @@ class ViewerFeed:
         for index, serial in enumerate(motion.serials):
             measured, predicted = motion.tau_measured_nm[:, index], motion.tau_predicted_nm[:, index]
             self._viewer.residuals(serial, t_ns, measured, predicted)
+
+    def result(self, session_ns: int, markdown: str) -> None:
+        """Show the tables of the result, in Markdown."""
+        self._viewer.result(session_ns - self._origin_ns, markdown)

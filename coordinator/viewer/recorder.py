@@ -14,9 +14,9 @@ from coordinator.viewer.scene.time_series import Batch, IntArray
 from module_agent.model.chain import Array, Chain
 from module_agent.wire.feedback_rows import Rows
 
-LEGEND = "Band: 1σ. Thin lines and spheres: 95 %. Grey: the truth, if known."
-# The camera is moved when the reach of the robot exceeds this many times the reach it was set for.
-OUTGROWN = 1.25
+LEGEND = "Band: 1σ. Thin lines and ellipsoids: 95 %. Grey: the truth, if known."
+# The camera is set for a robot larger than this by as much, and moved when the robot has outgrown that.
+ROOM = 1.25
 STYLES = {style.world: style for style in (robot_scene.ESTIMATE_STYLE, robot_scene.TRUTH_STYLE)}
 
 
@@ -187,6 +187,7 @@ class Recorder:
         sigma_m: Sequence[float] | None,
         world: str,
         types: Mapping[str, str] | None = None,
+        covariance: Array | None = None,
     ) -> None:
         """Draw the robot of a world from now on, in its latest posture; at q = 0 before the first pose.
 
@@ -196,7 +197,7 @@ class Recorder:
         self._register(chain.serials)
         self._log_poses()  # of the previous chain
         style = STYLES[world]
-        scene = robot_scene.build_scene(chain, self._types, self._palette, sigma_m, style)
+        scene = robot_scene.build_scene(chain, self._types, self._palette, sigma_m, style, covariance)
         self._set_time(t_ns)
         robot_scene.log_scene(self._stream, scene, self._posture(chain), self._scenes.get(world))
         self._scenes[world] = scene
@@ -234,6 +235,11 @@ class Recorder:
             thinned = time_series.envelope(t_ns, values)
             time_series.send_scalars(self._stream, entity_paths.residual_path(serial, group), *thinned)
 
+    def result(self, t_ns: int, markdown: str) -> None:
+        """Log the tables of the result."""
+        self._set_time(t_ns)
+        self._stream.log(entity_paths.RESULT, rr.TextDocument(markdown, media_type="text/markdown"))
+
     def _set_time(self, t_ns: int) -> None:
         """Set the session time of everything that is logged next."""
         self._stream.set_time(entity_paths.TIMELINE, duration=np.timedelta64(t_ns, "ns"))
@@ -249,11 +255,12 @@ class Recorder:
 
     def _frame(self, chain: Chain) -> None:
         placed = robot_geometry.modules(chain, self._types)
-        reach = robot_geometry.reach_m(chain, placed)
-        self._stream.log(entity_paths.GRAVITY, robot_scene.gravity_arrow(chain, reach))
+        ball = robot_geometry.ball_around(chain, placed, self._posture(chain))
+        self._stream.log(entity_paths.GRAVITY, robot_scene.gravity_arrow(chain, ball.radius_m))
         # The camera belongs to the user, unless the robot has outgrown the view.
-        if self._contents.reach_m is None or reach > OUTGROWN * self._contents.reach_m:
-            self._contents = self._contents._replace(reach_m=reach)
+        known = self._contents.ball
+        if known is None or not known._replace(radius_m=ROOM * known.radius_m).holds(ball):
+            self._contents = self._contents._replace(ball=ball)
             self.show_if_new()
 
     def _posture(self, chain: Chain) -> Array:

@@ -21,13 +21,20 @@ from module_agent.model.errors import RobotError, UsageError
 SETTLE_SECONDS = 40.0
 SAME_PICTURES = 3
 _POLL_SECONDS = 0.4
+_NS_PER_S = 1e9
 
 
 class ScreenshotFailed(RobotError):
     """No picture could be taken; the message says what to do."""
 
 
-def screenshot(rrd: Path, out: Path, tab: str | None = None, size: tuple[int, int] = (1600, 900)) -> None:
+def screenshot(
+    rrd: Path,
+    out: Path,
+    tab: str | None = None,
+    size: tuple[int, int] = (1600, 900),
+    at_s: float | None = None,
+) -> None:
     """Write one picture of a recording as a PNG.
 
     Args:
@@ -35,11 +42,12 @@ def screenshot(rrd: Path, out: Path, tab: str | None = None, size: tuple[int, in
         out: the PNG.
         tab: one of `blueprint.TABS`; the tab that the recording opens with if left out.
         size: width and height [pixels].
+        at_s: the time since the beginning of the session [s]; its end if left out.
 
     Raises:
         OSError: the recording cannot be read, or the picture not be written.
         ScreenshotFailed: no software Vulkan, not a recording of a run, or the viewer did not settle.
-        UsageError: there is no such tab.
+        UsageError: there is no such tab, or the time is before or after the recording.
     """
     if tab is not None and tab not in TABS:
         raise UsageError(f"no tab {tab!r}; there are {', '.join(TABS)}")
@@ -53,7 +61,7 @@ def screenshot(rrd: Path, out: Path, tab: str | None = None, size: tuple[int, in
         raise ScreenshotFailed(_advice(str(failure))) from failure
     try:
         client = ViewerClient.connect(proxy_url(port))
-        _open(client, rrd)
+        _open(client, rrd, at_s)
         if tab is not None:
             layout = client.get_blueprint("recording").blueprint
             client.set_blueprint(with_active_tab(layout, tab), "recording")
@@ -74,8 +82,8 @@ def _advice(output: str) -> str:
     )
 
 
-def _open(client: ViewerClient, rrd: Path) -> None:
-    """Open a recording, and show its end."""
+def _open(client: ViewerClient, rrd: Path, at_s: float | None) -> None:
+    """Open a recording, and show it at a time, by default its end."""
     client.open(str(rrd.resolve()))
     deadline = time.monotonic() + SETTLE_SECONDS
     while True:
@@ -93,7 +101,11 @@ def _open(client: ViewerClient, rrd: Path) -> None:
                 f"{rrd} has no timeline {entity_paths.TIMELINE!r}: it is not the recording of a run"
             )
         time.sleep(_POLL_SECONDS)
-    client.set_time(entity_paths.TIMELINE, duration=np.timedelta64(ends[0], "ns"), play_state="paused")
+    end_ns = int(ends[0])
+    if at_s is not None and not 0.0 <= at_s <= end_ns / _NS_PER_S:
+        raise UsageError(f"--at {at_s:g}: the recording is of 0 to {end_ns / _NS_PER_S:.1f} s")
+    at_ns = end_ns if at_s is None else round(at_s * _NS_PER_S)
+    client.set_time(entity_paths.TIMELINE, duration=np.timedelta64(at_ns, "ns"), play_state="paused")
 
 
 def with_active_tab(blueprint: Mapping[str, Any], tab: str) -> dict[str, Any]:

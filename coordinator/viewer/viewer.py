@@ -130,10 +130,21 @@ class Viewer:
         times = tuple(int(t) for t in t_ns)
         self._submit(lambda recorder: recorder.true_value(name, serial, float(value), times))
 
-    def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None = None) -> None:
-        """Draw the identified robot, with (n,) standard deviations of its joints' positions [m]."""
+    def chain(
+        self,
+        t_ns: int,
+        chain: Chain,
+        sigma_m: Sequence[float] | None = None,
+        covariance: ArrayLike | None = None,
+    ) -> None:
+        """Draw the identified robot, with (n,) standard deviations of its links [m].
+
+        covariance: (6 n, 6 n) of the chain's perturbations, for the ellipsoids of its joints.
+        """
         sigma = None if sigma_m is None else tuple(float(s) for s in sigma_m)
-        self._submit(lambda recorder: recorder.chain(t_ns, chain, sigma, entity_paths.ESTIMATED_WORLD))
+        spread = None if covariance is None else np.array(covariance, dtype=float)
+        world = entity_paths.ESTIMATED_WORLD
+        self._submit(lambda recorder: recorder.chain(t_ns, chain, sigma, world, covariance=spread))
 
     def true_chain(self, t_ns: int, chain: Chain, types: Mapping[str, str]) -> None:
         """Draw the true robot, of modules of these types, in grey; known to the simulator's tools only."""
@@ -168,6 +179,10 @@ class Viewer:
             shapes = f"{times.shape}, {measured.shape} and {predicted.shape}"
             raise ValueError(f"times, measured and predicted torque of {serial!r} have shapes {shapes}")
         self._submit(lambda recorder: recorder.residuals(serial, times, measured, predicted))
+
+    def result(self, t_ns: int, markdown: str) -> None:
+        """Show the tables of the result, in Markdown."""
+        self._submit(lambda recorder: recorder.result(t_ns, markdown))
 
     def close(self) -> None:
         """Write what is queued, complete the file and disconnect from live viewers. May be called twice."""

@@ -6,21 +6,28 @@ Wildcards in the middle of a path match nothing, silently; so every view names i
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings as bindings
 
 from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter
+from coordinator.viewer.scene.robot_geometry import Ball
 from coordinator.viewer.scene.topology_graph import Topology, extent
 
-IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
+IDENTIFICATION, DYNAMICS, IMU, MOTORS, NETWORK, RESULT = TABS = (
+    *("Identification", "Dynamics", "IMU"),
+    *("Motors", "Network", "Result"),
+)
 
 # More on one page would make plots too small to read; the rest is on further pages.
 MODULES_PER_PAGE = 4
 COLUMNS_PER_PAGE = 3
-# About a housing's length: margin around the reach of the joints.
+# About a housing's length: margin around the joints.
 HOUSING_M = 0.12
+# The camera looks from there, from so many radii of the robot that it stays in the picture when it moves.
+EYE_DIRECTION, EYE_DISTANCE = (0.48, -0.77, 0.42), 2.0
 
 _WHOLE_RUN = rr.TimeRange(
     rr.TimeRangeBoundary.absolute(seconds=0), rr.TimeRangeBoundary.cursor_relative(seconds=0)
@@ -34,7 +41,7 @@ class Contents(NamedTuple):
     serials: tuple[str, ...] = ()
     estimated: tuple[Parameter, ...] = ()
     topology: Topology | None = None
-    reach_m: float | None = None
+    ball: Ball | None = None
     truth: bool = False
 
 
@@ -46,7 +53,10 @@ def views(contents: Contents) -> Contents:
 
 def build(contents: Contents) -> rrb.Blueprint:
     """Return the layout for modules, estimates and topology."""
-    tabs = (_identification(contents), _dynamics(contents), _imu(contents), _network(contents))
+    tabs = (
+        *(_identification(contents), _dynamics(contents), _imu(contents)),
+        *(_motors(contents), _network(contents), _result()),
+    )
     return rrb.Blueprint(
         rrb.Horizontal(_left(contents), rrb.Tabs(*tabs, active_tab=0), column_shares=[2, 3]),
         rrb.TimePanel(state="collapsed", timeline=entity_paths.TIMELINE),
@@ -81,19 +91,17 @@ def _left(contents: Contents) -> rrb.Vertical:
         _of_modules(
             "Joint position [rad]", contents.serials, entity_paths.module_path, entity_paths.POSITION
         ),
-        row_shares=[1.5, 7, 3],
+        row_shares=[1.2, 6, 4],
     )
 
 
 def _robot(contents: Contents) -> rrb.Spatial3DView:
     eye = None
-    if contents.reach_m is not None:
-        size = contents.reach_m + HOUSING_M
+    if contents.ball is not None:
+        centre = np.array(contents.ball.centre_m)
+        away = EYE_DISTANCE * (contents.ball.radius_m + HOUSING_M)
         eye = rrb.EyeControls3D(
-            # Far enough for every posture, not only for the present one.
-            position=[0.75 * size, -1.2 * size, 0.68 * size],
-            look_target=[0.0, 0.0, 0.1 * size],
-            eye_up=[0.0, 0.0, 1.0],
+            position=centre + away * np.array(EYE_DIRECTION), look_target=centre, eye_up=[0.0, 0.0, 1.0]
         )
     return rrb.Spatial3DView(
         origin="/world",
@@ -207,6 +215,31 @@ def _imu(contents: Contents) -> rrb.Container:
     return _paged(plots, 2 * MODULES_PER_PAGE, IMU)
 
 
+def _motors(contents: Contents) -> rrb.Grid:
+    plots = (
+        ("PWM [-1 to 1]", entity_paths.PWM),
+        ("Current [A]", entity_paths.CURRENT),
+        ("Winding temperature [°C]", entity_paths.TEMPERATURE),
+        ("Bus voltage [V]", entity_paths.VOLTAGE),
+    )
+    views = (_of_modules(name, contents.serials, entity_paths.module_path, group) for name, group in plots)
+    return rrb.Grid(*views, grid_columns=2, name=MOTORS)
+
+
+def _result() -> rrb.Vertical:
+    # A container with a single view loses its name, and the log of the steps explains an empty table.
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin=entity_paths.RESULT, name="Result of the run"),
+        rrb.TextLogView(
+            origin=entity_paths.PHASE_LOG,
+            name="Steps",
+            columns=rrb.TextLogColumns(text_log_columns=["Body"]),
+        ),
+        row_shares=[4, 1],
+        name=RESULT,
+    )
+
+
 def _network(contents: Contents) -> rrb.Vertical:
     plots = (
         ("Round trip [ms]", entity_paths.ROUND_TRIP),
@@ -228,7 +261,12 @@ def _network(contents: Contents) -> rrb.Vertical:
 def _of_modules(
     name: str, serials: Sequence[str], path: Callable[[str, str], str], group: str
 ) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin="/", contents=[path(serial, group) for serial in serials], name=name)
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[path(serial, group) for serial in serials],
+        name=name,
+        axis_x=rrb.TimeAxis(view_range=_WHOLE_RUN),
+    )
 
 
 def _paged(views: Sequence[rrb.View], per_page: int, name: str) -> rrb.Container:

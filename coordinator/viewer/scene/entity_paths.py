@@ -6,6 +6,7 @@
 /residuals/<serial>/...         held-out torque, measured and predicted
 /network/<serial>/...           round trip, age of the newest sample, refusals
 /topology, /phase/...           the tree of modules; the steps of the run
+/result                         the tables of the result
 """
 
 import colorsys
@@ -53,11 +54,12 @@ GRAVITY: Final = "/world/gravity"
 TOPOLOGY: Final = "/topology"
 PHASE_LOG: Final = "/phase/log"
 PHASE_NOW: Final = "/phase/now"
+RESULT: Final = "/result"
 
 GYRO, ACCEL = "gyro", "accel"
 POSITION, VELOCITY, EFFORT = "position", "velocity", "effort"
 POSITION_COMMAND, VELOCITY_COMMAND, EFFORT_COMMAND = "position_command", "velocity_command", "effort_command"
-MOTOR, SUPPLY, STATE = "motor", "supply", "state"
+PWM, CURRENT, VOLTAGE, TEMPERATURE, STATE = "pwm", "current", "voltage", "temperature", "state"
 HELD_OUT, ERROR = "torque", "error"
 ROUND_TRIP, AGE, REFUSALS = "round_trip", "age", "refusals"
 

@@ -3,14 +3,16 @@
 The trees of a chain of several are drawn apart, because their relative pose is not known.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coordinator.description.module_geometry import Module, from_z, links, placed_modules
+from coordinator.description.module_geometry import Module, from_z, placed_modules
 from module_agent.model.catalogue import module_type
-from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.perturbation import apply_perturbation
 
 # Distance between the trees of a chain.
@@ -48,15 +50,33 @@ def upright(gravity: Array) -> Rotation:
     return from_z(gravity / length).inv()
 
 
-def reach_m(chain: Chain, placed: tuple[Module, ...]) -> float:
-    """Return the largest distance of a module from the root along the links [m]; no posture exceeds it."""
-    along: list[float] = []
-    for k, link in enumerate(links(chain, placed)):
-        parent = chain.parent[k]
-        before = 0.0 if parent == BASE else along[parent]
-        stacked = float(np.linalg.norm(placed[k].output - placed[k].housing[:3, 3]))
-        along.append(before + link.length_m + stacked)
-    return max(along, default=0.0)
+class Ball(NamedTuple):
+    """A ball that a drawn robot is in: its centre in the upright world [m], and its radius [m]."""
+
+    centre_m: tuple[float, float, float]
+    radius_m: float
+
+    def holds(self, other: "Ball") -> bool:
+        """Tell whether another ball is within this one."""
+        apart = float(np.linalg.norm(np.subtract(other.centre_m, self.centre_m)))
+        return apart + other.radius_m <= self.radius_m
+
+
+def ball_around(chain: Chain, placed: Sequence[Module], q_rad: Array) -> Ball:
+    """Return the ball around housings and outputs in a posture (n,), about the middle of their box."""
+    moved = np.concatenate([body_displacements(chain, q_rad[None, :])[0], np.eye(4)[None]])
+    corners = [
+        moved[body, :3, :3] @ place + moved[body, :3, 3]
+        for module in placed
+        for body, place in (
+            (module.housing_body, module.housing[:3, 3]),
+            (module.output_body, module.output),
+        )
+    ]
+    upright_corners = upright(chain.gravity).apply(np.array([*corners, np.zeros(3)]))
+    centre = 0.5 * (upright_corners.min(axis=0) + upright_corners.max(axis=0))
+    x, y, z = centre.tolist()
+    return Ball((x, y, z), float(np.linalg.norm(upright_corners - centre, axis=1).max()))
 
 
 def side_by_side(chain: Chain) -> Chain:

@@ -9,17 +9,20 @@ from scipy.spatial.transform import Rotation
 
 from coordinator.description.module_geometry import Link, Module, from_z, links
 from coordinator.viewer.scene import entity_paths
-from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS
 from coordinator.viewer.scene.robot_geometry import modules, upright
 from coordinator.viewer.scene.time_series import IntArray, time_column
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.forward_kinematics import body_displacements
+from module_agent.model.perturbation import skew
 
 LINK_RADIUS_M = 0.009
 OUTPUT_RADIUS_M = 0.024
 OUTPUT_THICKNESS_M = 0.008
 AXIS_LENGTH_M = 0.09
 IMU_AXIS_LENGTH_M = 0.05
+MAX_LONG_LABELS = 4
+# A normally distributed point is in this ellipsoid with 95 %: the root of chi^2 of three degrees of freedom.
+ELLIPSOID_SIGMAS = 2.7955
 
 Drawn = rr.AsComponents
 
@@ -68,6 +71,7 @@ def build_scene(
     colours: Mapping[str, entity_paths.Colour],
     sigma_m: Sequence[float] | None = None,
     style: SceneStyle = ESTIMATE_STYLE,
+    covariance: Array | None = None,
 ) -> Scene:
     """Draw a chain at q = 0.
 
@@ -75,8 +79,9 @@ def build_scene(
         chain: n joints.
         types: module type's name by serial.
         colours: the modules' colours by serial.
-        sigma_m: (n,) standard deviation of each joint's position [m]; not finite if unknown.
+        sigma_m: (n,) standard deviation of the link to each joint [m]; not finite if unknown.
         style: world and colours.
+        covariance: (6 n, 6 n) of the chain's perturbations, for ellipsoids that hold the joints with 95 %.
 
     Raises:
         KeyError: a serial has no type or colour.
@@ -85,7 +90,7 @@ def build_scene(
     if sigma_m is not None and len(sigma_m) != len(chain.serials):
         raise ValueError(f"{len(sigma_m)} sigmas for a chain of {len(chain.serials)} joints")
     paint = [style.uniform or colours[serial] for serial in chain.serials]
-    painter = _Painter(chain, modules(chain, types), paint, sigma_m, style)
+    painter = _Painter(chain, modules(chain, types), paint, sigma_m, style, covariance)
     vertical = rr.Transform3D(quaternion=_quaternion(upright(chain.gravity)))
     drawn: list[tuple[str, tuple[Drawn, ...]]] = [(style.world, (vertical,))]
     for body in range(BASE, len(chain.serials)):
@@ -122,9 +127,9 @@ def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: 
         stream.send_columns(entity_paths.body_path(scene.style.world, serial), [time_column(t_ns)], moved)
 
 
-def gravity_arrow(chain: Chain, reach_m: float) -> rr.Arrows3D:
+def gravity_arrow(chain: Chain, radius_m: float) -> rr.Arrows3D:
     """Return gravity as an arrow next to the robot, in the upright world."""
-    length = 0.25 * max(reach_m, 0.2)
+    length = 0.3 * max(radius_m, 0.2)
     strength = float(np.linalg.norm(chain.gravity))
     return rr.Arrows3D(
         origins=[[-length, -0.4 * length, 1.4 * length]],
@@ -144,6 +149,7 @@ class _Painter(NamedTuple):
     paint: Sequence[entity_paths.Colour]
     sigma_m: Sequence[float] | None
     style: SceneStyle
+    covariance: Array | None
 
     def body(self, body: int) -> list[tuple[str, tuple[Drawn, ...]]]:
         """Draw what a body carries."""
@@ -161,8 +167,9 @@ class _Painter(NamedTuple):
             drawn.append((f"{path}/output", (self._outputs(turning),)))
         if body != BASE:
             drawn.append((f"{path}/axis", (self._axis(body),)))
-            if self.sigma_m is not None and np.isfinite(self.sigma_m[body]):
-                drawn.append((f"{path}/spread", (self._spread(body, self.sigma_m[body]),)))
+            unknown = self.sigma_m is not None and not np.isfinite(self.sigma_m[body])
+            if self.covariance is not None and not unknown:
+                drawn.append((f"{path}/spread", (self._spread(body, self.covariance),)))
         joined = [link for link in links(chain, placed) if link.body == body and link.length_m > 1e-4]
         # The base is at the first module of the identified robot; the truth may be drawn elsewhere.
         if joined and not (body == BASE and style.uniform is not None):
@@ -183,7 +190,8 @@ class _Painter(NamedTuple):
 
     def _label(self, k: int) -> str:
         name = self.chain.serials[k] + (" (reversed)" if self.chain.reversed[k] else "")
-        if self.sigma_m is None or self.sigma_m[k] == 0.0:  # the root is the reference of the others
+        # The root is the reference of the others; of many modules the labels would hide the robot.
+        if self.sigma_m is None or self.sigma_m[k] == 0.0 or len(self.placed) > MAX_LONG_LABELS:
             return name
         if not np.isfinite(self.sigma_m[k]):
             return f"{name}  position unknown"
@@ -207,10 +215,17 @@ class _Painter(NamedTuple):
             colors=[entity_paths.shade(self.paint[k], 1.4)],
         )
 
-    def _spread(self, k: int, sigma_m: float) -> rr.Ellipsoids3D:
+    def _spread(self, k: int, covariance: Array) -> rr.Ellipsoids3D:
+        """Draw where the joint may be, as the covariance of its twist (w, v) moves it: w x p + v."""
+        own, place = slice(6 * k, 6 * k + 6), self.placed[k].output
+        slope = np.hstack([-skew(place), np.eye(3)])
+        variances, axes = np.linalg.eigh(slope @ covariance[own, own] @ slope.T)
+        # Eigenvectors may be left-handed; an ellipsoid is the same with one of its axes turned about.
+        axes[:, 2] *= np.linalg.det(axes)
         return rr.Ellipsoids3D(
-            centers=[self.placed[k].output],
-            radii=[NINETY_FIVE_SIGMAS * sigma_m],  # as the intervals of the plots
+            centers=[place],
+            half_sizes=[ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))],
+            quaternions=[_quaternion(Rotation.from_matrix(axes))],
             colors=[self.style.link],
             fill_mode="transparentfillmajorwireframe",
         )

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 # At most two rows per interval are logged. On 1500 pixels a minute looks the same as with all rows.
 INTERVAL_NS = 40_000_000
 # Voltage and temperature change over seconds.
-SUPPLY_INTERVAL_NS = 1_000_000_000
+SLOW_INTERVAL_NS = 1_000_000_000
 
 
 class Batch(NamedTuple):
@@ -53,10 +53,12 @@ FAST: tuple[Series, ...] = (
     Series(entity_paths.EFFORT_COMMAND, ("effort_command_nm",), _COMMAND),
     Series(entity_paths.GYRO, ("gyro_rad_s",), _XYZ),
     Series(entity_paths.ACCEL, ("accel_m_s2",), _XYZ),
-    Series(entity_paths.MOTOR, ("pwm", "motor_current_a"), ("PWM", "current")),
+    Series(entity_paths.PWM, ("pwm",)),
+    Series(entity_paths.CURRENT, ("motor_current_a",)),
 )
-SUPPLY = Series(
-    entity_paths.SUPPLY, ("voltage_v", "winding_temperature_c"), ("bus voltage", "winding temperature")
+SLOW: tuple[Series, ...] = (
+    Series(entity_paths.VOLTAGE, ("voltage_v",)),
+    Series(entity_paths.TEMPERATURE, ("winding_temperature_c",)),
 )
 
 
@@ -95,15 +97,16 @@ def _first_rows(t_ns: IntArray, interval_ns: int) -> NDArray[np.intp]:
 
 
 def send_rows(stream: rr.RecordingStream, batch: Batch) -> None:
-    """Log the envelopes of a batch without commands that are never set, and the supply once a second."""
+    """Log the envelopes of a batch without commands that are never set, and the slow ones once a second."""
     for series in FAST:
         values = series.values(batch.rows)
         if series.components != _COMMAND or not np.isnan(values).all():
             path = entity_paths.module_path(batch.serial, series.group)
             send_scalars(stream, path, *envelope(batch.t_ns, values))
-    slow = _first_rows(batch.t_ns, SUPPLY_INTERVAL_NS)
-    path = entity_paths.module_path(batch.serial, SUPPLY.group)
-    send_scalars(stream, path, batch.t_ns[slow], SUPPLY.values(batch.rows[slow]))
+    rows = _first_rows(batch.t_ns, SLOW_INTERVAL_NS)
+    for series in SLOW:
+        path = entity_paths.module_path(batch.serial, series.group)
+        send_scalars(stream, path, batch.t_ns[rows], series.values(batch.rows[rows]))
 
 
 def send_scalars(stream: rr.RecordingStream, path: str, t_ns: IntArray, values: FloatArray) -> None:
@@ -151,7 +154,7 @@ def log_module_styles(stream: rr.RecordingStream, serial: str, colour: entity_pa
         lines = rr.SeriesLines(names=labels, colors=list(colours), widths=widths, **style)
         stream.log(path, lines, static=True)
 
-    for series in (*FAST, SUPPLY):
+    for series in (*FAST, *SLOW):
         shades = entity_paths.axis_shades(colour)[: len(series.components)]
         colours = (entity_paths.COMMAND_COLOUR,) if series.components == _COMMAND else shades
         log(entity_paths.module_path(serial, series.group), series.components, colours)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.description.module_geometry import from_z, links
 from coordinator.viewer.scene import robot_scene
-from coordinator.viewer.scene.robot_geometry import modules, reach_m, side_by_side, upright
+from coordinator.viewer.scene.robot_geometry import ball_around, modules, side_by_side, upright
 from coordinator.viewer.scene.topology_graph import as_topology, extent, positions
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import body_displacements, imu_poses
@@ -79,12 +79,19 @@ def _arm() -> tuple[Chain, dict[str, str]]:
     return chain, {"a": "X5-9", "b": "X5-4"}
 
 
+@settings(deadline=None)
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
-def test_no_posture_takes_a_module_out_of_reach(q0: float, q1: float) -> None:
+def test_the_camera_is_set_for_a_ball_that_holds_all_modules(q0: float, q1: float) -> None:
     arm, types = _arm()
-    placed = modules(arm, types)
-    for module, motion in zip(placed, body_displacements(arm, np.array([[q0, q1]]))[0], strict=True):
-        assert np.linalg.norm((motion @ [*module.output, 1.0])[:3]) <= reach_m(arm, placed) + 1e-9
+    q = np.array([q0, q1])
+    ball = ball_around(arm, modules(arm, types), q)
+    moved = body_displacements(arm, q[None])[0]
+    for module, motion in zip(modules(arm, types), moved, strict=True):
+        assert np.linalg.norm((motion @ [*module.output, 1.0])[:3] - ball.centre_m) <= ball.radius_m + 1e-9
+    # And is no larger than the box around them.
+    assert ball.radius_m <= 0.5 * np.linalg.norm([0.4, 0.4, 0.5])
+    assert ball._replace(radius_m=1.1 * ball.radius_m).holds(ball)
+    assert not ball.holds(ball._replace(centre_m=(1.0, 0.0, 0.0)))
 
 
 def test_sigmas_of_another_robot_are_refused(arm: Chain, types: dict[str, str]) -> None:
