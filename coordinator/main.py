@@ -9,6 +9,7 @@ COMMANDS = {
     "list": ("list_modules.list_modules", "List the modules on the network."),
     "stop": ("list_modules.stop", "Stop every module of a robot at once."),
     "keys": ("keys.keys", "Make the keys and certificates for --secure."),
+    "view": ("view.view", "Show the recording of a run, on this screen or in a browser."),
     "screenshot": ("screenshot.screenshot", "Render a recording as a PNG file."),
     "check": ("measured_again.check_robot", "Find the links that changed since an earlier run."),
     "payload": ("measured_again.find_payload", "Measure the payload that a robot carries."),

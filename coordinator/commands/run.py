@@ -19,7 +19,7 @@ from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal, new_table
 from coordinator.session.run import Run, RunConfig, write_outputs
-from coordinator.viewer.targets import viewer_choice
+from coordinator.viewer.targets import SERVE_PORT, viewer_choice
 from module_agent.model.errors import UsageError
 
 
@@ -48,7 +48,7 @@ def run(
     ] = "none",
     serve_port: Annotated[
         int, typer.Option(min=1, max=65534, help="Port of the viewer served to a browser.")
-    ] = 9090,
+    ] = SERVE_PORT,
     resume: Annotated[bool, typer.Option(help="Continue the crashed run in --out.")] = False,
     speed: Speed = 1.0,
     report: WithReport = True,
@@ -78,6 +78,8 @@ def run(
         result, _ = run_attended(config, place, speed, terminal, advice)
     print_result(result, terminal)
     terminal.console.print(f"written to {out}{report_at(out)}", markup=False, soft_wrap=True)
+    if viewer == "serve":
+        terminal.note(f"the page has ended; to see the run again: x5-coordinator view {out} --serve")
 
 
 def replay(

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 NATIVE_PORT = 9876
+# Of pages served to a browser; their data are on the next one. (9090 is where rosbridge listens.)
+SERVE_PORT = 9878
 WEB_MEMORY = "256MB"
 SCHEMES = ("rerun", "rerun+http", "rerun+https")
 # Rows that are logged one by one, such as estimates, share a chunk of a file for this long.
@@ -91,8 +93,7 @@ def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
         web_server = _started("web", options, port + 1)
     if port is not None and web_server is not None:
         urls.append(proxy_url(port + 1))
-        page = quote(proxy_url(port + 1), safe="")
-        logger.info("open http://127.0.0.1:%d?url=%s in a browser", port, page)
+        logger.info("open %s in a browser", page_url(port))
     reached = [url for url in dict.fromkeys(urls) if url is not None and _reachable(url)]
     if reached:
         live = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id)
@@ -103,6 +104,11 @@ def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
 def proxy_url(port: int) -> str:
     """Return the address of a viewer on this machine."""
     return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def page_url(port: int) -> str:
+    """Return the address of a page served on a port; without that of its data the page is empty."""
+    return f"http://127.0.0.1:{port}?url={quote(proxy_url(port + 1), safe='')}"
 
 
 def _reachable(url: str) -> bool:

@@ -1,0 +1,48 @@
+"""`x5-coordinator view`: a finished run in the viewer, on this screen or in a browser."""
+
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coordinator.recording.run_folder import VIEW
+from coordinator.runtime.command_line import CommandFailed
+from coordinator.viewer import viewer_process
+from coordinator.viewer.targets import SERVE_PORT, WEB_MEMORY, page_url
+from module_agent.model.errors import EXIT_FAILED, UsageError
+
+_POLL_S = 0.2
+
+
+def view(
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or a session.rrd.")],
+    serve: Annotated[bool, typer.Option("--serve", help="Serve it to a browser, until Ctrl-C.")] = False,
+    port: Annotated[
+        int, typer.Option(min=1, max=65534, help="Port of the page; the next one has the data.")
+    ] = SERVE_PORT,
+) -> None:
+    """Show the recording of a run; the viewer's window stays open, a served page until Ctrl-C."""
+    recording = run / VIEW if run.is_dir() else run
+    if not recording.is_file():
+        raise UsageError(f"{recording}: there is no such recording; a run writes {VIEW} into its folder")
+    if not viewer_process.is_recording(recording):
+        raise UsageError(f"{recording} is not a Rerun recording: it does not begin with 'RRF'")
+    if not serve:
+        viewer_process.start([str(recording)], viewer_process.free_port(), detached=True)
+        return
+    for taken in (port, port + 1):
+        if viewer_process.listens("127.0.0.1", taken):
+            raise UsageError(f"--port {port}: something listens on port {taken} already; choose another")
+    options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
+    served = viewer_process.start([str(recording), *options], port + 1, detached=False)
+    typer.echo(f"open {page_url(port)} in a browser; Ctrl-C ends it")
+    try:
+        pause = threading.Event()
+        while served.process.poll() is None:
+            pause.wait(_POLL_S)
+        raise CommandFailed(f"the viewer ended: {served.output_tail()}", EXIT_FAILED)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer_process.stop(served)
