@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, ValidationError, model_validator
 
 from module_agent.model.errors import UsageError
-from module_agent.network_emulation.toml_location import faults_of
+from module_agent.model.toml_location import faults_of
 from sim.geometry.link_parts import Strict, Xyz
 
 _NOTHING = (0.0, 0.0, 0.0)
