@@ -10,12 +10,13 @@ with theta the integral of the motor's speed over the gear ratio, and d the defl
 them. a is 1 for a healthy module.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.identification.sensor_checks import EXPLORATION, NAMED_ABOVE, Finding
+from coordinator.identification.finding import Finding, Sickness
+from coordinator.identification.sensor_checks import EXPLORATION, NAMED_ABOVE, SERIOUS_ABOVE
 from coordinator.recording.recording import Recording
 from module_agent.model.chain import Array
 from module_agent.signals.filtering import NS_PER_S
@@ -40,6 +41,11 @@ _WHAT = "its motor's speed over its joint's"
 _OTHER_TYPE = "it seems to be of another type than it reports"
 _OPPOSED = "its encoder or its motor counts backwards"
 _SCALED = "its encoder's scale is estimated; check its gear ratio and type"
+_KINDS: Mapping[str, Sickness] = {
+    _OTHER_TYPE: "type_mislabelled",
+    _OPPOSED: "encoder_sign",
+    _SCALED: "encoder_scale",
+}
 
 
 class GearDoubts(NamedTuple):
@@ -73,7 +79,10 @@ def gear_trains(recording: Recording, serials: Sequence[str]) -> GearDoubts:
             measured = gear_ratio / (turn or 1e-9)
             remedy = _SCALED if abs(measured / gear_ratio - 1.0) < OTHER_TYPE else _OTHER_TYPE
             remedy = _OPPOSED if turn < 0.0 else remedy
-            findings.append(Finding(serial, EXPLORATION, _WHAT, measured, gear_ratio, off, "", remedy))
+            kind, serious = _KINDS[remedy], off > SERIOUS_ABOVE
+            findings.append(
+                Finding(serial, EXPLORATION, _WHAT, measured, gear_ratio, off, "", remedy, kind, serious)
+            )
     by = {remedy: [f for f in findings if f.remedy == remedy] for remedy in (_OPPOSED, _OTHER_TYPE, _SCALED)}
     other_type, scaled = (tuple(f.serial for f in by[remedy]) for remedy in (_OTHER_TYPE, _SCALED))
     return GearDoubts(tuple(findings), tuple(by[_OPPOSED]), other_type, scaled)

@@ -1,16 +1,16 @@
 """Results of an identification: topology, chain, inertia, held-out motions."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement
 from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.dynamics.torque_prediction import TorqueError
+from coordinator.identification.finding import Finding, SensorError
 from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import Result
-from coordinator.identification.sensor_checks import Finding
 from coordinator.kinematics.assembly import ChainFit
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.recording.recording import Recording
@@ -21,14 +21,28 @@ from module_agent.signals.clock_map import ClockMap
 
 
 class IdentificationError(DataError):
-    """Data is missing from the recording; the message says what and where."""
+    """Data is missing from the recording, or contradicts itself; the message says what and where.
+
+    findings: the sick sensors that are the cause; without any, nothing is known to be sick.
+    """
+
+    findings: tuple[Finding, ...] = ()
+
+    @classmethod
+    def of(cls, error: Exception) -> Self:
+        """Return the failure of an identification by another error, with the sick sensors that it names."""
+        failure = cls(str(error))
+        if isinstance(error, SensorError):
+            failure.findings, failure.exit_code = error.findings, error.exit_code
+        return failure
 
 
 class Kinematics(NamedTuple):
     """Topology and chain: `first` as assembled from the circles, `refinement` by the batch estimator.
 
     findings: sensors that contradict the catalogue or the others. measured: earlier recordings of some of the
-    modules, from which the refinement took the prior of their IMUs.
+    modules, from which the refinement took the prior of their IMUs. excluded: modules without which the robot
+    is identified, as their sensors are sick. damage: sentences on what cannot be read of the recording.
     """
 
     topology: Topology
@@ -38,6 +52,13 @@ class Kinematics(NamedTuple):
     notes: tuple[str, ...]
     findings: tuple[Finding, ...] = ()
     measured: tuple[CalibrationInformation, ...] = ()
+    excluded: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
+
+    @property
+    def suspicions(self) -> list[str]:
+        """Why the robot is not to be believed as usual, as sentences; none of healthy robots."""
+        return [*(one.summary for one in self.findings if one.serious), *self.damage]
 
     @property
     def fit(self) -> ChainEstimate:

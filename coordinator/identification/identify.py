@@ -133,7 +133,7 @@ def identify_topology(recording: Recording) -> Topology:
     try:
         return search_topology(recording, _explored(recording)).topology
     except (DataError, np.linalg.LinAlgError) as error:
-        raise IdentificationError(str(error)) from error
+        raise IdentificationError.of(error) from error
 
 
 def identify_kinematics(
@@ -185,7 +185,7 @@ def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
             *sampling_notes(recording, clocks, everyone, later, REFINEMENT_CUTOFF_HZ),
         )
     except (DataError, np.linalg.LinAlgError) as error:
-        raise IdentificationError(str(error)) from error
+        raise IdentificationError.of(error) from error
     return kept._replace(clocks=clocks, notes=tuple(dict.fromkeys((*kept.notes, *sampling))))
 
 
@@ -238,7 +238,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
         )
     except (DataError, np.linalg.LinAlgError) as error:
-        raise IdentificationError(str(error)) from error
+        raise IdentificationError.of(error) from error
     notes = tuple(
         f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"
         # Copies: during a session late estimates still arrive.

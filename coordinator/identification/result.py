@@ -265,7 +265,11 @@ def undetermined(parts: Sequence[IdentifiabilityPart]) -> dict[str, tuple[str, .
 
 
 class SensorPart(Part):
-    """A sensor that contradicts its catalogue or the others; measured and expected in `unit`."""
+    """A sensor that contradicts its catalogue or the others; measured and expected in `unit`.
+
+    kind: what is wrong with which sensor, one of `finding.Sickness`; empty in older files. serious: because
+    of it the result is not to be believed as usual, and the program ended with exit code 5.
+    """
 
     serial: str
     motion: str
@@ -275,6 +279,8 @@ class SensorPart(Part):
     sigmas: float
     unit: str
     summary: str
+    kind: str = ""
+    serious: bool = False
 
 
 class Result(Part):
@@ -282,6 +288,8 @@ class Result(Part):
 
     chain_covariance and null_basis, (6 n, 6 n) and (6 n, k), are over the perturbations of
     `model.perturbation`: per module of the chain a twist of its pose at q = 0 in the root frame.
+    excluded: modules without which the robot was identified, as their sensors are sick. suspicions: why the
+    result is not to be believed as usual; none of healthy robots.
     """
 
     robot: str
@@ -304,6 +312,8 @@ class Result(Part):
     dynamics: DynamicsPart | None
     notes: list[str]
     sensors: list[SensorPart] = Field(default_factory=list)
+    excluded: list[str] = Field(default_factory=list)
+    suspicions: list[str] = Field(default_factory=list)
     imu_places: list[ImuPlacePart] = Field(default_factory=list)
     robot_time_s: float
     wall_time_s: float | None

@@ -83,6 +83,8 @@ def build_result(
         notes=[*kinematics.notes, *filter(None, notes)],
         imu_places=imu_place_parts(kinematics.refinement.calibration),
         sensors=[SensorPart.of(one, summary=one.summary) for one in kinematics.findings],
+        excluded=list(kinematics.excluded),
+        suspicions=kinematics.suspicions,
         robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
         wall_time_s=finished[-1].wall_time_s if finished else None,
         trace_hash=recording.trace_hash,

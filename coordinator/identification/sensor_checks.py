@@ -13,12 +13,12 @@ import numpy as np
 from coordinator.batch_estimation.estimator import SYSTEMATIC, Refinement
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
+from coordinator.identification.finding import Finding, SensorError, Sickness
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import STEP_NS
 from coordinator.topology.topology import Observations, Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.clock_map import ClockMap
@@ -28,6 +28,8 @@ from module_agent.signals.filtering import JointMotion
 DIRECTION_SIGMA_RAD = 0.05
 # Of some 30 checks of a robot none is beyond this by chance in 500 robots.
 NAMED_ABOVE = 4.0
+# Beyond this a sensor is sick beyond doubt: what models lack is a few sigmas, too.
+SERIOUS_ABOVE = 8.0
 # A joint that was moved alone travels at least this far, and any other less than the share of it.
 TRAVEL_RAD, HELD_SHARE = 0.05, 0.3
 
@@ -42,37 +44,6 @@ _SCALED = "the scale is estimated; check its gear ratio and type"
 _SENSORS = (("the residual of its gyro", "rad/s"), ("the residual of its accelerometer", "m/s^2"))
 _UNMODELLED = "a link or the base gives more than the model has, or the sensor is sick; the claim is widened"
 _OPPOSED = "the sign of its effort or of its encoder is wrong"
-
-
-class Finding(NamedTuple):
-    """A sensor that contradicts its catalogue or the others.
-
-    motion: those in which it shows. measured, expected: in `unit`. sigmas: how far apart they are. remedy:
-    what to check, as a phrase.
-    """
-
-    serial: str
-    motion: str
-    what: str
-    measured: float
-    expected: float
-    sigmas: float
-    unit: str = ""
-    remedy: str = ""
-
-    @property
-    def summary(self) -> str:
-        """The finding as a sentence."""
-        unit = f" {self.unit}" if self.unit else ""
-        text = (
-            f"{self.serial}: {self.what} is {self.measured:.4g}{unit} in {self.motion}, "
-            f"{self.expected:.4g}{unit} is expected ({self.sigmas:.0f} sigmas apart)"
-        )
-        return f"{text}: {self.remedy}" if self.remedy else text
-
-
-class SensorError(DataError):
-    """Sensors whose readings cannot be used as they are; the message names them."""
 
 
 class Travel(NamedTuple):
@@ -130,21 +101,24 @@ def check_encoder_travels(travels: Sequence[Travel]) -> None:
     """
     turned: dict[str, str] = {}
     cases: dict[str, str] = {}
+    exchanged: dict[str, Finding] = {}
     for joint, motion, asked, by_encoder in travels:
         if joint not in by_encoder:
             continue
         own, most = by_encoder[joint], max(by_encoder, key=lambda s: abs(by_encoder[s]))
         if own < -max(TRAVEL_RAD, HELD_SHARE * asked):
-            raise SensorError(
+            text = (
                 f"{joint}: its encoder turned by {own:.2g} rad in its {motion} motion, {asked:.2g} rad were "
                 "commanded: its encoder counts backwards"
             )
+            raise SensorError(text, [_travel(joint, motion, own, asked, "encoder_sign")])
         far = abs(by_encoder[most])
         if far > TRAVEL_RAD and abs(own) < HELD_SHARE * far:
             cases[joint] = (
                 f"moving {joint} turned its encoder by {own:.2g} rad and that of {most} by {far:.2g}"
             )
             turned[joint] = most
+            exchanged[joint] = _travel(joint, motion, own, asked, "encoders_exchanged")
         else:
             turned.setdefault(joint, joint)
     # A joint that is stuck turns another's encoder as well, but no other joint turns its own.
@@ -152,8 +126,14 @@ def check_encoder_travels(travels: Sequence[Travel]) -> None:
     if cycle:
         raise SensorError(
             f"the encoders of {' and '.join(cycle)} are exchanged ({'; '.join(cases[s] for s in cycle)}): "
-            "check which serial is where, and the columns of the recording"
+            "check which serial is where, and the columns of the recording",
+            [exchanged[s] for s in cycle],
         )
+
+
+def _travel(joint: str, motion: str, turned: float, asked: float, kind: Sickness) -> Finding:
+    what, sigmas = "the turn of its encoder", abs(turned - asked) / TRAVEL_RAD
+    return Finding(joint, f"its {motion} motion", what, turned, asked, sigmas, "rad", "", kind, True)
 
 
 def _followed(turned: Mapping[str, str], serial: str) -> list[str]:
@@ -196,13 +176,22 @@ def check_encoder_signs(signs: Mapping[str, tuple[float, float]]) -> None:
     """Raise a SensorError that names the encoders that count backwards, if there are any."""
     findings = [
         Finding(
-            serial, "its slow motions", "the encoder's sign", sign, 1.0, (1.0 - sign) / sigma, "", _BACKWARDS
+            serial,
+            "its slow motions",
+            "the encoder's sign",
+            sign,
+            1.0,
+            (1.0 - sign) / sigma,
+            "",
+            _BACKWARDS,
+            "encoder_sign",
+            True,
         )
         for serial, (sign, sigma) in signs.items()
         if sign < -NAMED_ABOVE * sigma
     ]
     if findings:
-        raise SensorError("; ".join(finding.summary for finding in findings))
+        raise SensorError("; ".join(finding.summary for finding in findings), findings)
 
 
 def effort_signs(chain: Chain, kinds: Sequence[ModuleType], motion: JointMotion) -> list[Finding]:
@@ -231,6 +220,8 @@ def effort_signs(chain: Chain, kinds: Sequence[ModuleType], motion: JointMotion)
             float((1.0 - s) / LOAD_SIGMA),
             "",
             _OPPOSED,
+            "effort_sign",
+            True,
         )
         for serial, s, c, rms in zip(chain.serials, slope, alike, size, strict=True)
         if c < -ALIKE_ABOVE and rms > LOAD_NM
@@ -241,7 +232,7 @@ def check_opposed(findings: Sequence[Finding], signs: Mapping[str, tuple[float, 
     """Raise a SensorError with the findings on joints whose encoder's sign no other IMU observes."""
     open_ = [f for f in findings if signs.get(f.serial, (1.0, np.inf))[1] * NAMED_ABOVE > 1.0]
     if open_:
-        raise SensorError("; ".join(finding.summary for finding in open_))
+        raise SensorError("; ".join(finding.summary for finding in open_), open_)
 
 
 def doubted_sensors(
@@ -262,13 +253,25 @@ def doubted_sensors(
         what = f"the place of its IMU along {'xyz'[worst]} against its catalogued place"
         if away[worst] > NAMED_ABOVE:
             off = 1e3 * float(off_m[worst]), 0.0, float(away[worst])
-            findings.append(Finding(serials[k], EXPLORATION, what, *off, "mm", _MISLABELLED))
+            findings.append(
+                Finding(
+                    serials[k],
+                    EXPLORATION,
+                    what,
+                    *off,
+                    "mm",
+                    _MISLABELLED,
+                    "imu_place",
+                    bool(away[worst] > SERIOUS_ABOVE),
+                )
+            )
     for k in encoders:
         scale, sigma = float(refined.encoder_scale[k]), float(refined.encoder_scale_sigma[k])
         if abs(scale) > NAMED_ABOVE * sigma:
             read = 1.0 / (1.0 + scale), 1.0, abs(scale) / max(sigma, 1e-9)
+            what, serious = "its encoder's scale against the gyros", read[2] > SERIOUS_ABOVE
             findings.append(
-                Finding(serials[k], EXPLORATION, "its encoder's scale against the gyros", *read, "", _SCALED)
+                Finding(serials[k], EXPLORATION, what, *read, "", _SCALED, "encoder_scale", serious)
             )
     return findings
 
@@ -288,8 +291,9 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
             measured, expected = float(refined.residuals[sensor, motion, k]), float(noise[sensor, motion, k])
             what, unit = _SENSORS[sensor]
             off = (measured - expected) / expected
+            kind: Sickness = "accelerometer_contradicts" if sensor else "gyro_contradicts"
             findings.append(
-                Finding(serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED)
+                Finding(serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED, kind)
             )
     return findings
 

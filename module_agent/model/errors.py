@@ -4,7 +4,7 @@ A RobotError is raised for what may go wrong with a correct program. Everything 
 is a programming error and ends it with a traceback; a RobotError is therefore never a ValueError.
 """
 
-EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
+EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_SUSPECT, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 
 class RobotError(Exception):

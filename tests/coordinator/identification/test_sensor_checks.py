@@ -8,8 +8,8 @@ import pytest
 
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
+from coordinator.identification.finding import SensorError
 from coordinator.identification.sensor_checks import (
-    SensorError,
     Travel,
     check_encoder_signs,
     check_encoder_travels,
