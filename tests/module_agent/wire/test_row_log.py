@@ -1,5 +1,7 @@
 """Whatever order rows arrive in, what is there is right and what is missing is known."""
 
+import tracemalloc
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import WireError
-from module_agent.wire.row_log import RowLog
+from module_agent.wire.row_log import MAX_ROWS, RowLog
 
 
 def block(first: int, count: int) -> Feedback:
@@ -80,3 +82,49 @@ def test_rows_that_arrive_after_a_look_are_in_the_next_one() -> None:
     other = log.copied()
     other.add(block(40, 10))
     assert (len(log.between(0, 10**12)), len(other.between(0, 10**12))) == (5, 15)
+
+
+def test_a_look_that_began_before_earlier_rows_came_sees_the_rows_that_it_found() -> None:
+    log = RowLog(1)
+    log.add(block(1000, 300))
+    looked_up = log._times()
+    # Another thread adds what a network has delayed, and drops what is old, before the rows are taken.
+    log.add(block(10, 40))
+    log.forget_before(1100)
+    log._index = looked_up._replace(changes=log._changes)
+    assert log.between(1050, 1149)["t_ns"].tolist() == list(range(1050, 1150))
+    assert log.range_between(1050, 1149) == (1050, 1150)
+
+
+def test_two_rows_far_apart_take_no_memory_for_those_between_them() -> None:
+    log = RowLog(1)
+    tracemalloc.start()
+    log.add(block(0, 1))
+    log.add(block(MAX_ROWS - 1, 1))
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Two pages of 26 kB; the rows between them would be 404 MB.
+    assert taken < 500_000
+    assert log.missing(0, MAX_ROWS) == [(1, MAX_ROWS - 1)]
+    assert log.rows(0, MAX_ROWS)["t_ns"].tolist() == [0, MAX_ROWS - 1]
+
+
+def test_rows_scattered_as_no_network_does_are_refused_and_true_ones_still_kept() -> None:
+    log = RowLog(1)
+    for number in range(0, MAX_ROWS - 1000, 1000):
+        with suppress(WireError):
+            log.add(block(number, 1))
+    with pytest.raises(WireError, match="scattered"):
+        log.add(block(MAX_ROWS - 1000, 1))
+    # 65 free pages, and one for every 32 rows.
+    assert log.count < 80
+    log.add(block(2, 200))
+    assert log.rows(2, 202)["t_ns"].tolist() == list(range(2, 202))
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.5, 0.8])
+def test_a_network_that_loses_most_of_an_hour_fills_a_log(lost: float) -> None:
+    log, kept = RowLog(1), np.random.default_rng(1).random(900_000 // 40) >= lost
+    for first in np.flatnonzero(kept) * 40:
+        log.add(block(int(first), 40))
+    assert log.count == 40 * kept.sum()
