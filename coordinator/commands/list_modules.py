@@ -1,36 +1,59 @@
 """`x5-coordinator list` and `stop`: the modules on the network, without a lease."""
 
+import json
+from collections.abc import Mapping
+
 import typer
+from rich.table import Table
 
 from coordinator.commands.options import AsJson, ConnectOptions, Expect
 from coordinator.live_robot.connection import Place, new_sender, open_connection
-from coordinator.live_robot.discovery import AS_HUB_S, Search, listed, stop_robot
+from coordinator.live_robot.discovery import AS_HUB_S, Listing, Search, listed, stop_robot
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.runtime.terminal import Terminal, figure, new_table
+from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Transport
 
 
 @with_options
 def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = False) -> None:
-    """List the modules on the network: state, holder of the lease, refused messages.
+    """List the modules on the network: state, holder of the lease, delay of feedback, refused messages.
 
     Exit codes: 0 all answer, 1 a module does not answer or too few do, 2 wrong usage.
     """
     place = at.place()
     transport, search = _open_search(place, at.quiet, expect)
-    statuses, silent = listed(transport, place.robot, search)
+    found = listed(transport, place.robot, search)
+    delays = {one.serial: one for one in feedback_delays(found.recording)}
     if as_json:
-        typer.echo("[" + ",\n ".join(status.model_dump_json() for status in statuses) + "]")
+        known = [(status.model_dump(), delays.get(status.serial)) for status in found.statuses]
+        rows = [each | {"feedback_delay": delay and delay._asdict()} for each, delay in known]
+        typer.echo("[" + ",\n ".join(json.dumps(row) for row in rows) + "]")
     else:
-        table = new_table(place.robot, "serial | state | holder | expiries | refused")
-        for status in statuses:
-            refused = ", ".join(f"{k} {v}" for k, v in status.refusals.items())
-            table.add_row(
-                status.serial, status.state, status.holder or "-", str(status.expiries), refused or "-"
+        Terminal().console.print(_table(place.robot, found, delays))
+        if found.cpu_us_per_message is not None:
+            Terminal(at.quiet).note(
+                f"{found.cpu_us_per_message:.0f} us of processor time a message received here"
             )
-        Terminal().console.print(table)
-    _check(place.robot, len(statuses), expect, "status", silent)
+    _check(place.robot, len(found.statuses), expect, "status", found.silent)
+
+
+def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> Table:
+    """Return the modules with the delay of their feedback from sample to here."""
+    table = new_table(robot, "serial | state | holder | >delay p50 [ms] | >p99 [ms] | expiries | refused")
+    for status in found.statuses:
+        delay = delays.get(status.serial)
+        table.add_row(
+            status.serial,
+            status.state,
+            status.holder or "-",
+            figure(delay and delay.p50_ms, ".1f"),
+            figure(delay and delay.p99_ms, ".1f"),
+            str(status.expiries),
+            ", ".join(f"{k} {v}" for k, v in status.refusals.items()) or "-",
+        )
+    return table
 
 
 @with_options

@@ -283,8 +283,22 @@ class SensorPart(Part):
     serious: bool = False
 
 
+class DelayPart(Part):
+    """The delay of a module's feedback from sample to coordinator; see `synchronisation.feedback_delays`."""
+
+    serial: str
+    messages: int
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+    clock_sigma_ms: float
+
+
 class Result(Part):
     """All results of one session.
+
+    feedback_delays: by serial. cpu_us_per_message: processor time of the coordinator's event loop for a
+    message received, its recording and display included; None in virtual time and in older recordings.
 
     chain_covariance and null_basis, (6 n, 6 n) and (6 n, k), are over the perturbations of
     `model.perturbation`: per module of the chain a twist of its pose at q = 0 in the root frame.
@@ -315,8 +329,10 @@ class Result(Part):
     excluded: list[str] = Field(default_factory=list)
     suspicions: list[str] = Field(default_factory=list)
     imu_places: list[ImuPlacePart] = Field(default_factory=list)
+    feedback_delays: list[DelayPart] = Field(default_factory=list)
     robot_time_s: float
     wall_time_s: float | None
+    cpu_us_per_message: float | None = None
     trace_hash: str
     schema_version: int = Field(default=SCHEMA, alias="schema")
 

@@ -11,6 +11,7 @@ from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import (
     BodiesPart,
     ChainPart,
+    DelayPart,
     DhPart,
     DhRowPart,
     DynamicsPart,
@@ -35,6 +36,7 @@ from coordinator.kinematics.null_space import Unresolved
 from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
 from coordinator.parameter_fit.report_parts import base_parameter_parts, finite, imu_place_parts
 from coordinator.recording.recording import Recording
+from coordinator.synchronisation.feedback_delays import feedback_delays
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array
@@ -85,8 +87,10 @@ def build_result(
         sensors=[SensorPart.of(one, summary=one.summary) for one in kinematics.findings],
         excluded=list(kinematics.excluded),
         suspicions=kinematics.suspicions,
+        feedback_delays=[DelayPart(**one._asdict()) for one in feedback_delays(recording)],
         robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
         wall_time_s=finished[-1].wall_time_s if finished else None,
+        cpu_us_per_message=finished[-1].cpu_us_per_message if finished else None,
         trace_hash=recording.trace_hash,
     )
 

@@ -8,13 +8,17 @@ from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
 from coordinator.live_robot.messenger import Clock, Messenger
-from module_agent.transport.transport import Event, Liveness, Reply, Transport
+from coordinator.recording.recording import Entry, Recording
+from module_agent.transport.transport import Event, Liveness, Reply, Sample, Transport
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Ask, Message, Status, Stop
 from module_agent.wire.refusal import WireError
 
 ANSWER_S = 1.0
+# Feedback is heard for this long to tell its delay, and its clocks are mapped by so many requests.
+LISTEN_S = 1.0
+TRIPS = 5
 POLL_S = 0.02
 
 Request = Callable[[str], Message]
@@ -98,16 +102,73 @@ def _ask_all(
     return serials, answers
 
 
-def listed(transport: Transport, robot: str, search: Search) -> tuple[list[Status], list[str]]:
-    """Return the statuses, and the serials without a readable answer. Closes the transport."""
+class Listing(NamedTuple):
+    """What `listed` found.
 
-    def request(serial: str) -> Ask:
-        return Ask(serial=serial, boot=0, seq=1, sender="list")
+    silent: serials without a readable answer. recording: the feedback and the round trips of the search, on
+    this process's steady clock. cpu_us_per_message: processor time of the process for each message received.
+    """
 
-    serials, answers = _ask_all(transport, robot, search, Leaf.STATUS, request, Status)
-    statuses = [answers[s] for s in serials if s in answers]
-    known = [status.serial for status in statuses]
-    return statuses, [s for s in serials if s not in known]
+    statuses: list[Status]
+    silent: list[str]
+    recording: Recording
+    cpu_us_per_message: float | None
+
+
+def listed(transport: Transport, robot: str, search: Search, listen_s: float = LISTEN_S) -> Listing:
+    """Ask all modules for their status, several times while their feedback is heard for `listen_s`.
+
+    Closes the transport.
+    """
+    arrived: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
+    recording, received = Recording(), 0
+
+    def sink(event: Event) -> None:
+        arrived.put((time.monotonic_ns(), event))
+
+    def take_until(end_s: float, complete: Callable[[], bool] = lambda: False) -> None:
+        nonlocal received
+        while not complete() and (left_s := end_s - time.monotonic()) > 0.0:
+            with suppress(queue.Empty):
+                t_ns, event = arrived.get(timeout=left_s)
+                received += 1
+                _record(recording, open_tags, t_ns, event)
+
+    open_tags: set[int] = set()
+    try:
+        serials = _present(transport, robot, search)
+        begun_s, cpu_s = time.monotonic(), time.process_time()
+        transport.subscribe(every(robot, Leaf.FEEDBACK), sink)
+        for number in range(TRIPS):
+            for place, serial in enumerate(serials):
+                tag = number * len(serials) + place + 1
+                topic, payload = key(robot, serial, Leaf.STATUS), encode(_ask(serial, tag))
+                open_tags.add(tag)
+                recording.accept(Entry("request", topic, time.monotonic_ns(), payload))
+                transport.query(topic, payload, ANSWER_S, sink, tag)
+            take_until(begun_s + listen_s * (number + 1) / TRIPS)
+        take_until(time.monotonic() + ANSWER_S + 5.0, lambda: not open_tags)
+        cpu_s = time.process_time() - cpu_s
+    finally:
+        transport.close()
+    found = {s: module.status for s, module in recording.modules.items() if module.status is not None}
+    statuses = [status for serial in serials if (status := found.get(serial)) is not None]
+    silent = [serial for serial in serials if serial not in found]
+    return Listing(statuses, silent, recording, 1e6 * cpu_s / received if received else None)
+
+
+def _ask(serial: str, seq: int) -> Ask:
+    return Ask(serial=serial, boot=0, seq=seq, sender="list")
+
+
+def _record(recording: Recording, open_tags: set[int], t_ns: int, event: Event) -> None:
+    """Add an event to a recording; a reply closes its tag."""
+    if isinstance(event, Reply):
+        open_tags.discard(event.tag)
+        if event.payload is not None:
+            recording.accept(Entry("reply", event.key, t_ns, event.payload))
+    elif isinstance(event, Sample):
+        recording.accept(Entry("publication", event.key, t_ns, event.payload))
 
 
 def stop_robot(transport: Transport, robot: str, sender: str, search: Search) -> tuple[list[str], list[str]]:

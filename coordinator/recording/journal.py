@@ -24,7 +24,7 @@ class JournalEvent(BaseModel):
     `explored`: topology and chain are identified from what was recorded before this event. `settled`: the
     clocks are mapped by the round trips before this event; later requests to the modules do not change them.
     `deaf`: modules that did not confirm the stop of a failed session; None in an older journal, which names
-    them in its text.
+    them in its text. `finished`: `cpu_us_per_message` is what receiving and recording a message cost.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -42,6 +42,7 @@ class JournalEvent(BaseModel):
     imu: ImuKind = "uncalibrated"
     torque: TorqueKind = "uncalibrated"
     wall_time_s: float | None = None
+    cpu_us_per_message: float | None = None
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:

@@ -7,10 +7,12 @@ results. The recording's hash is the trace hash of the run.
 import copy
 import hashlib
 import struct
+from array import array
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.recording.journal import JournalEvent, Purpose
@@ -50,12 +52,41 @@ class RoundTrip(NamedTuple):
     module_ns: int
 
 
+class Arrivals:
+    """Module times of the newest rows of published messages, and the session times of their arrival [ns]."""
+
+    def __init__(self, row_ns: Sequence[int] = (), arrival_ns: Sequence[int] = ()) -> None:
+        self._row_ns = array("q", row_ns)
+        self._arrival_ns = array("q", arrival_ns)
+
+    def add(self, row_ns: int, arrival_ns: int) -> None:
+        """Note a message."""
+        self._row_ns.append(row_ns)
+        self._arrival_ns.append(arrival_ns)
+
+    def columns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return both times, (n,) each, as a copy: others may be added meanwhile."""
+        # The arrival is added last.
+        arrival = np.array(self._arrival_ns[:], np.int64)
+        return np.array(self._row_ns[: len(arrival)], np.int64), arrival
+
+    def copied(self) -> "Arrivals":
+        """Return the arrivals so far, to which later ones are not added."""
+        return Arrivals(self._row_ns[:], self._arrival_ns[:])
+
+    def forget(self, kept: int) -> None:
+        """Drop all but the newest."""
+        surplus = max(0, len(self._row_ns) - kept)
+        del self._row_ns[:surplus], self._arrival_ns[:surplus]
+
+
 class ModuleRecord:
     """What is known of one boot of one module; times in nanoseconds.
 
     newest_ns: latest module time in any message. feedback_ns: session time at which feedback was published
     last, None before the first. newest_row_ns, newest_row_arrival_ns: module time of the newest published
     row, and session time at which it first arrived; messages that come late or twice do not change them.
+    arrivals: of all published messages whose rows had not come before.
     """
 
     def __init__(self, serial: str, boot: int):
@@ -71,6 +102,7 @@ class ModuleRecord:
         self.feedback_ns: int | None = None
         self.newest_row_ns = -1
         self.newest_row_arrival_ns = 0
+        self.arrivals = Arrivals()
 
     @property
     def trips(self) -> list[RoundTrip]:
@@ -81,11 +113,13 @@ class ModuleRecord:
         """Return a record of the rows and round trips so far, to which later ones are not added."""
         record = copy.copy(self)
         record.rows, record.round_trips = self.rows.copied(), list(self.round_trips)
+        record.arrivals = self.arrivals.copied()
         return record
 
     def forget(self, rows: int, round_trips: int) -> None:
         """Drop all but the newest rows and round trips, for sessions that go on for long."""
         self.rows.forget_before(self.rows.end_row - rows)
+        self.arrivals.forget(rows)
         del self.round_trips[: max(0, len(self.round_trips) - round_trips)]
 
 
@@ -188,12 +222,15 @@ class Recording:
     def _note(self, module: ModuleRecord, message: Message, entry: Entry) -> None:
         match message:
             case Feedback():
+                is_new = not module.rows.has(message.first_row + message.count - 1)
                 rows = module.rows.add(message)
                 if len(rows):
                     row_ns = int(rows["t_ns"][-1])
                     module.newest_ns = max(module.newest_ns, row_ns)
                     if entry.kind == "publication":
                         module.feedback_ns = entry.t_ns
+                        if is_new:
+                            module.arrivals.add(row_ns, entry.t_ns)
                         if row_ns > module.newest_row_ns:
                             module.newest_row_ns, module.newest_row_arrival_ns = row_ns, entry.t_ns
             case Status() | Ack():

@@ -33,6 +33,7 @@ from coordinator.report.plots import (
     time_line_plot,
 )
 from coordinator.report.result_sections import HALF_95, HeldOutTorques, result_sections, sure_topology
+from coordinator.synchronisation.feedback_delays import feedback_delays
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import DataError, UsageError
 
@@ -285,7 +286,9 @@ def _network(recording: Recording) -> Section:
     except DataError:
         clocks = {}
     rows = []
+    delays = {one.serial: one for one in feedback_delays(recording)}
     for serial, ms in trips_ms.items():
+        delay = delays.get(serial)
         log, clock = recording.modules[serial].rows, clocks.get(serial)
         lost = sum(end - first for first, end in log.missing(log.first_row, log.end_row))
         rows.append(
@@ -296,6 +299,8 @@ def _network(recording: Recording) -> Section:
                 float(np.percentile(ms, 95)),
                 log.end_row - log.first_row,
                 lost,
+                delay.p50_ms if delay is not None else None,
+                delay.p99_ms if delay is not None else None,
                 _NS * clock.offset_ns if clock is not None else None,
                 1e-6 * HALF_95 * clock.sigma_ns if clock is not None else None,
                 1e6 * clock.drift if clock is not None else None,
@@ -308,6 +313,8 @@ def _network(recording: Recording) -> Section:
         Column(name="95th percentile", unit="ms", form=".2f", group="round trips"),
         Column(name="published", form=".0f", group="feedback rows"),
         Column(name="missing", form=".0f", group="feedback rows"),
+        Column(name="median", unit="ms", form=".2f", group="feedback, sample to coordinator"),
+        Column(name="99th percentile", unit="ms", form=".2f", group="feedback, sample to coordinator"),
         Column(name="offset", unit="s", form=".6f", group="clock against the session"),
         Column(name="± 95 %", unit="ms", form=".3f", group="clock against the session"),
         Column(name="drift", unit="ppm", form=".1f", group="clock against the session"),
@@ -320,10 +327,15 @@ def _network(recording: Recording) -> Section:
             svg=delay_plot(trips_ms),
         ),
     ]
-    missing = "Rows that were lost at first were asked for again; missing are those that never came."
+    missing = (
+        "Rows that were lost at first were asked for again; missing are those that never came. The delay of "
+        "feedback is the age of a message's newest row when it arrived."
+    )
+    costs = [event.cpu_us_per_message for event in recording.journal if event.cpu_us_per_message]
+    cost = f" Receiving and recording a message took {costs[-1]:.0f} µs of processor time." if costs else ""
     refused = ", ".join(f"{count} {reason}" for reason, count in sorted(recording.refused.items()))
     unreadable = f" Unreadable messages: {refused}." if refused else ""
-    blocks.append(Paragraph(text=missing + unreadable))
+    blocks.append(Paragraph(text=missing + cost + unreadable))
     return Section(title="Network and clocks", blocks=tuple(blocks))
 
 

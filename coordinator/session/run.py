@@ -154,7 +154,9 @@ class Run:
         self._identified: Identified | None = None
         if crashed is not None:
             self._take_over(crashed)
-        self._messenger = Messenger(transport, config.robot, clock, post, self._record)
+        # Virtual time has no cost of its own that would be one of the machine's.
+        cpu_clock = None if config.inline else time.thread_time_ns
+        self._messenger = Messenger(transport, config.robot, clock, post, self._record, cpu_clock)
         self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender)
         self._requests = InformationRequests(
             self._messenger, self.recording, clock, config.sender.name, self.note
@@ -315,7 +317,10 @@ class Run:
             kinematics = await self._request_information()
             self._journal(
                 JournalEvent(
-                    t_ns=self._clock(), what="finished", wall_time_s=time.monotonic() - self._started_s
+                    t_ns=self._clock(),
+                    what="finished",
+                    wall_time_s=time.monotonic() - self._started_s,
+                    cpu_us_per_message=self._messenger.cpu_us_per_message,
                 )
             )
             # Nothing more is recorded: a replay must read exactly what this result is computed from.

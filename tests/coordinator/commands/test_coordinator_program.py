@@ -23,10 +23,11 @@ from coordinator.recording.run_folder import SESSION, RunFolderError, check_free
 from coordinator.recording.session_file import SessionWriter
 from coordinator.runtime.command_line import ENDINGS, ending
 from coordinator.runtime.event_loop import Interruption, run_to_end
+from coordinator.synchronisation.feedback_delays import feedback_delays
 from coordinator.viewer.targets import ViewerTargets, viewer_choice
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
 from module_agent.model.errors import UsageError
-from module_agent.transport.transport import Event, Liveness, Reply, Sink
+from module_agent.transport.transport import Event, Liveness, Reply, Sample, Sink
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ask, Status, Stop
@@ -262,6 +263,12 @@ class Robot:
     def undeclare(self) -> None:
         pass
 
+    def subscribe(self, key_expr: str, sink: Sink) -> "Robot":
+        for serial in self.serials:
+            message = self.wire.feedback(serial)
+            sink(Sample(key("arm", serial, Leaf.FEEDBACK), encode(message)))
+        return self
+
     def query(self, at: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         serial = at.split("/")[2]
         event: Event = Reply(tag, at, None, "Timeout")
@@ -271,8 +278,9 @@ class Robot:
 
     def answer(self, serial: str, at: str, payload: bytes) -> bytes:
         if at.endswith("status"):
-            assert decode(Ask, payload).serial == serial
-            return encode(self.wire.status().model_copy(update={"serial": serial}))
+            asked = decode(Ask, payload)
+            assert asked.serial == serial
+            return encode(self.wire.status(serial, re=asked.seq))
         self.stopped.append(decode(Stop, payload).serial)
         return encode(self.wire.ack(serial=serial))
 
@@ -285,11 +293,20 @@ QUICK = Search(quiet_s=0.02)
 
 def test_every_module_is_listed_and_who_does_not_answer_is_named(wire: Any) -> None:
     robot: Any = Robot(wire, ("B", "A", "C"), deaf=("C",))
-    statuses, deaf = listed(robot, "arm", QUICK)
+    statuses, deaf, *_ = listed(robot, "arm", QUICK, listen_s=0.1)
     assert [status.serial for status in statuses] == ["A", "B"]
     assert all(isinstance(status, Status) for status in statuses)
     assert deaf == ["C"]
     assert robot.closed
+
+
+def test_the_delay_of_feedback_is_heard_meanwhile(wire: Any) -> None:
+    robot: Any = Robot(wire, ("A", "B"), deaf=("B",))
+    found = listed(robot, "arm", QUICK, listen_s=0.1)
+    # Five requests tell the clock of a module; of one that does not answer nothing is claimed.
+    assert len(found.recording.modules["A"].round_trips) == 5
+    assert [(one.serial, one.messages) for one in feedback_delays(found.recording)] == [("A", 1)]
+    assert found.cpu_us_per_message is not None
 
 
 def test_every_module_is_stopped_and_who_does_not_confirm_is_named(wire: Any) -> None:
@@ -300,7 +317,7 @@ def test_every_module_is_stopped_and_who_does_not_confirm_is_named(wire: Any) ->
 
 def test_a_search_ends_with_the_last_module_that_is_expected(wire: Any) -> None:
     robot: Any = Robot(wire, ("A", "B", "C"))
-    statuses, _ = listed(robot, "arm", QUICK._replace(expect=2))
+    statuses = listed(robot, "arm", QUICK._replace(expect=2), listen_s=0.1).statuses
     assert [status.serial for status in statuses] == ["A", "B"]
 
 
@@ -314,8 +331,8 @@ def test_a_hub_waits_for_agents_that_try_once_a_second(wire: Any) -> None:
             return self
 
     late: Any = Late(wire, ("A",))
-    statuses, _ = listed(late, "arm", QUICK)
+    statuses = listed(late, "arm", QUICK, listen_s=0.1).statuses
     assert statuses == []
     late = Late(wire, ("A",))
-    statuses, _ = listed(late, "arm", Search(quiet_s=0.02, min_s=20.0, expect=1))
+    statuses = listed(late, "arm", Search(quiet_s=0.02, min_s=20.0, expect=1), listen_s=0.1).statuses
     assert [status.serial for status in statuses] == ["A"]
