@@ -17,7 +17,7 @@ import json
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
@@ -102,8 +102,8 @@ class ZenohTransport:
             if key is not None:
                 declaration.deliver(Sample(key, sample.payload.to_bytes()))
 
-        declare = self._session.declare_subscriber
-        return self._declare(declaration, f"subscribe to {key_expr}", lambda: declare(key_expr, on_sample))
+        declare, handler = self._session.declare_subscriber, _direct(on_sample)
+        return self._declare(declaration, f"subscribe to {key_expr}", lambda: declare(key_expr, handler))
 
     def serve(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Request` for every query on a matching key; an unanswered one times out at its asker.
@@ -118,8 +118,8 @@ class ZenohTransport:
             if key is not None:
                 declaration.deliver(Request(key, payload, Answer(partial(_reply, query, key))))
 
-        declare = self._session.declare_queryable
-        return self._declare(declaration, f"serve {key_expr}", lambda: declare(key_expr, on_query))
+        declare, handler = self._session.declare_queryable, _direct(on_query)
+        return self._declare(declaration, f"serve {key_expr}", lambda: declare(key_expr, handler))
 
     def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         """Ask; the first answer wins. Without any, the one `Reply` carries the reason as `error`."""
@@ -132,7 +132,7 @@ class ZenohTransport:
             # default lets a full link block the caller for seconds.
             self._session.get(
                 key,
-                zenoh.handlers.Callback(partial(_finish, question), lambda: question.finish(None, NO_ANSWER)),
+                _direct(partial(_finish, question), lambda: question.finish(None, NO_ANSWER)),
                 payload=payload,
                 # By default a queryable that calls itself complete is asked in place of the module's own.
                 target=zenoh.QueryTarget.ALL,
@@ -159,7 +159,7 @@ class ZenohTransport:
         return self._declare(
             declaration,
             f"watch {key_expr}",
-            lambda: self._session.liveliness().declare_subscriber(key_expr, on_token, history=True),
+            lambda: self._session.liveliness().declare_subscriber(key_expr, _direct(on_token), history=True),
         )
 
     def close(self) -> None:
@@ -220,6 +220,17 @@ class ZenohTransport:
     def _forget_question(self, question: Question) -> None:
         with self._lock:
             self._questions.pop(question, None)
+
+
+def _direct(
+    callback: Callable[[Any], None], drop: Callable[[], None] | None = None
+) -> "zenoh.handlers.Callback[Any]":
+    """Return a handler that is run by the thread that receives, since sinks only enqueue.
+
+    By default every declaration and every query has a thread of its own: 11 threads a module, and 0.4 ms of
+    processor time for a query instead of 0.2.
+    """
+    return zenoh.handlers.Callback(callback, drop, indirect=False)
 
 
 def _finish(question: Question, reply: zenoh.Reply) -> None:
