@@ -227,7 +227,7 @@ class AgentHost:
             declared += [
                 transport.subscribe(module.key(leaf), module.sink(leaf)) for leaf in PUBLISHED_TO_MODULE
             ]
-        declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._from_others.put))
+        declared.append(transport.subscribe(every(self._robot, Leaf.MOTION), self._from_others.put))
         # Last, so that everything else is in place when the token is seen.
         declared += [transport.declare_alive(module.key(Leaf.ALIVE)) for module in self.modules]
 
@@ -326,7 +326,7 @@ class AgentHost:
             return
         _, serial, leaf = parse(event.key)
         max_bytes = TOPICS[leaf].max_bytes_from_module
-        if leaf is Leaf.STATUS:
+        if leaf is Leaf.MOTION:
             status = _of(serial, decode(Status, event.payload, max_bytes))
             self._motion_listener.on_status(status, self.now_ns, clocks)
         else:

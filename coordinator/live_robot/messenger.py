@@ -24,7 +24,7 @@ from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Message
 from module_agent.wire.proof import proven
 from module_agent.wire.refusal import WireError
-from module_agent.wire.topics import PUBLISHED_BY_MODULE
+from module_agent.wire.topics import HEARD_BY_COORDINATOR
 
 Clock = Callable[[], int]
 """Returns session time in integer nanoseconds; it never goes back."""
@@ -105,7 +105,7 @@ class Messenger:
 
     def start(self) -> None:
         """Begin to listen."""
-        for leaf in PUBLISHED_BY_MODULE:
+        for leaf in HEARD_BY_COORDINATOR:
             self._declared.append(self._transport.subscribe(every(self.robot, leaf), self._sink))
         self._declared.append(self._transport.watch_alive(every(self.robot, Leaf.ALIVE), self._sink))
 

@@ -23,6 +23,7 @@ from module_agent.hardware.hardware import Modules, ModuleSample
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
+    EXPLORATION_KINDS,
     Ack,
     Ask,
     Feedback,
@@ -43,6 +44,8 @@ from module_agent.wire.refusal import Refusal, WireError
 FIRMWARE_NAME = "x5-agent 0.1"
 MAX_ROWS_PER_ANSWER = 256
 STATUS_PERIOD_NS = 400_000_000
+# How long after its end a motion is announced to the other modules: a network may lose ten of them in turn.
+ANNOUNCED_NS = 5_000_000_000
 # A fault at the temperature at which a module has no PWM left, and armed again only when it has cooled.
 WINDING_LIMIT_C = 154.0
 WINDING_REARM_C = 140.0
@@ -121,6 +124,7 @@ class Firmware:
         self._setpoint: Command = MOTOR_OFF
         self._fresh_ns = 0
         self._stopped_ns = 0
+        self._announced_until_ns = 0
         self._expiries = 0
         self._seq = 0
         self._now_ns = 0
@@ -166,8 +170,15 @@ class Firmware:
                 out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(*batch))))
         if self._now_ns >= self._status_due_ns:
             self._status_due_ns = self._now_ns + STATUS_PERIOD_NS
-            out.append(Publication(Leaf.STATUS, encode(self._status(re=0))))
+            status = encode(self._status(re=0))
+            out.append(Publication(Leaf.STATUS, status))
+            if self._announces_motion():
+                out.append(Publication(Leaf.MOTION, status))
         return out
+
+    def _announces_motion(self) -> bool:
+        explores = self._record is not None and self._record.pattern.kind in EXPLORATION_KINDS
+        return explores and (self._motion is not None or self._now_ns < self._announced_until_ns)
 
     def quiet_state(self) -> QuietState:
         """Return what quiet ticks after this one need."""
@@ -293,6 +304,7 @@ class Firmware:
             if self._record.pattern.kind == "rest":
                 self.last_rest = self._record
         self._motion = None
+        self._announced_until_ns = self._now_ns + ANNOUNCED_NS
         self._status_due_ns = 0
 
     def _receive(self, incoming: Incoming) -> None:

@@ -1,18 +1,17 @@
 """The motions of all joints, collected for the modules of one agent process, which estimate from them.
 
-The status of a module announces its motion. Its feedback is then subscribed to, and rows that the network
-dropped are requested from its history. A complete motion goes to every module of the process. No I/O:
-subscriptions and requests are returned as actions.
+A module announces its motion by its status, on `motion`. Its feedback is then subscribed to, and rows that
+the network dropped are requested from its history. A complete motion goes to every module of the process. No
+I/O: subscriptions and requests are returned as actions.
 """
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import Feedback, MotionRecord, Status
+from module_agent.wire.messages import EXPLORATION_KINDS, Feedback, MotionRecord, Status
 from module_agent.wire.row_log import RowLog
 
-EXPLORATION_KINDS = ("constant", "windowed_sine")
 ANSWER_TIMEOUT_NS = 400_000_000
 GIVE_UP_NS = 5_000_000_000
 ROWS_PER_QUESTION = 256
@@ -127,7 +126,8 @@ class MotionListener:
             track = self._tracks[status.serial] = _Track(status, record, now_ns)
             self._actions.append(Listen(status.serial, True))
         if track.record.end_row is None:
-            # Counted from when the end is known, so that lost rows are not requested for ever.
+            # From the last announcement without an end, and with it from when the end is known, so that
+            # neither an end that never comes nor lost rows are waited for for ever.
             track.give_up_ns = now_ns + GIVE_UP_NS
         track.record = record
         track.note_arrival(status.t_ns, own_ns)
@@ -154,6 +154,8 @@ class MotionListener:
         for track in list(self._tracks.values()):
             end = track.record.end_row
             if end is None:
+                if now_ns >= track.give_up_ns:
+                    self._drop(track.serial)
                 continue
             missing = track.log.missing(track.record.start_row, end)
             if not missing:

@@ -121,6 +121,9 @@ Pattern = Annotated[
     Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern | MultiSine, Field(discriminator="kind")
 ]
 
+# The motions that all modules estimate from.
+EXPLORATION_KINDS = ("constant", "windowed_sine")
+
 
 class EffortProfile(Part):
     """The effort that a motion is fed forward: torques of the spring [Nm], at equal times from its start.
@@ -221,6 +224,9 @@ class Feedback(Message):
 
 class Status(Message):
     """The state of a module. Published on `status` at every change and twice a second at least, and on `Ask`.
+
+    While an exploration motion runs, and for some seconds after it, the same is published on `motion`, for
+    the other modules.
 
     `re` is the sequence number of the question that this answers, 0 when published.
     """

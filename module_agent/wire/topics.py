@@ -31,10 +31,14 @@ Exchange = Literal["publication", "request", "reply"]
 
 
 class Topic(NamedTuple):
-    """The messages of one leaf. Sizes bound the bytes that a receiver decodes, to and from the module."""
+    """The messages of one leaf. Sizes bound the bytes that a receiver decodes, to and from the module.
+
+    heard_by: coordinators do not listen to publications for `modules`.
+    """
 
     purpose: str
     publication: type[Message] | None = None
+    heard_by: Literal["all", "modules"] = "all"
     published_by: Literal["module", "coordinator"] = "module"
     request: type[Message] | None = None
     reply: type[Message] = Ack
@@ -78,7 +82,12 @@ TOPICS: dict[Leaf, Topic] = {
         max_bytes_from_module=MAX_MESSAGE_BYTES,
     ),
     Leaf.LEASE: Topic("Acquire, renew or release the command of the joint.", request=LeaseRequest),
-    Leaf.MOTION: Topic("Start a motion that runs on the module.", request=MotionCommand),
+    Leaf.MOTION: Topic(
+        "Start a motion that runs on the module; the module announces it to the others by its status.",
+        publication=Status,
+        heard_by="modules",
+        request=MotionCommand,
+    ),
     Leaf.SETPOINT: Topic("Stream setpoints to the joint.", publication=Setpoint, published_by="coordinator"),
     Leaf.STOP: Topic(
         "Stop at once; needs no lease.",
@@ -115,4 +124,5 @@ TOPICS: dict[Leaf, Topic] = {
 SERVED = tuple(leaf for leaf, topic in TOPICS.items() if topic.request)
 _PUBLISHED = {leaf: topic.published_by for leaf, topic in TOPICS.items() if topic.publication}
 PUBLISHED_BY_MODULE = tuple(leaf for leaf, sender in _PUBLISHED.items() if sender == "module")
+HEARD_BY_COORDINATOR = tuple(leaf for leaf in PUBLISHED_BY_MODULE if TOPICS[leaf].heard_by == "all")
 PUBLISHED_TO_MODULE = tuple(leaf for leaf, sender in _PUBLISHED.items() if sender == "coordinator")

@@ -109,7 +109,7 @@ def throw_all(
         for serial in serials:
             for leaf in Leaf:
                 throw(key(name, serial, leaf), without_values(leaf)[reason])
-    # Each module reads the questions and publications of its own keys, and the status of every module.
+    # Each module reads the questions and publications of its own keys, and the announced motions of all.
     each = len(SERVED) + len(PUBLISHED_TO_MODULE) + len(serials)
     settled({s: Counter(dict.fromkeys(REASONS, each)) for s in serials}, none)
 
@@ -117,7 +117,8 @@ def throw_all(
     for serial in serials:
         for leaf, fields in not_finite().items():
             throw(key(name, serial, leaf), msgpack.packb({"v": 1, **commander.head(serial), **fields}))
-    settled({s: Counter(not_finite=len(not_finite())) for s in serials}, so_far)
+    # As a publication a command of a motion is no announcement of one.
+    settled({s: Counter(not_finite=len(not_finite()), types=len(serials)) for s in serials}, so_far)
 
     # Wildcards reach all of a module's keys at once; larger than any message, or than Zenoh itself takes.
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}

@@ -181,7 +181,7 @@ def test_noise_on_a_neighbours_keys_is_counted_and_does_no_harm(rigs: Callable[.
         dropped_events=0,
     )
     for payload in (b"", b"\xc1", b"\x81" * 5000, encode(status)):
-        noise.publish(key(rig.robot.name, "X-12345", Leaf.STATUS), payload)
+        noise.publish(key(rig.robot.name, "X-12345", Leaf.MOTION), payload)
     rig.run(asyncio.sleep(0.1))
     refused = rig.hosts[TIP].modules[0].firmware.admission.refusals
     assert sum(refused.values()) == 4
@@ -209,7 +209,7 @@ def test_one_message_of_an_intruder_does_not_end_an_agent(
     head = {"serial": serial, "boot": 1, "seq": 1, "t_ns": 0, "state": "moving", "holder": None}
     rest = {"lease_left_ns": 0, "token": 0, "next_row": 0, "refusals": {}, "expiries": 0, "dropped_events": 0}
     status = Status.model_construct(**head, **rest, motion=record)
-    intruder.publish(f"x5/{rig.robot.name}/{serial}/status", encode(status))
+    intruder.publish(f"x5/{rig.robot.name}/{serial}/motion", encode(status))
     rig.run(asyncio.sleep(0.1))
     for host in rig.hosts.values():
         assert host.modules[0].firmware.admission.refusals == {reason: 1}

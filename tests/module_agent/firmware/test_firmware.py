@@ -764,3 +764,34 @@ def test_the_secret_ends_with_the_lease() -> None:
     bench.ticks(310)
     assert bench.acquire(sender="other").accepted
     assert bench.setpoint(sender="other").accepted
+
+
+def test_a_motion_that_others_estimate_from_is_announced_to_them_until_five_seconds_after_its_end() -> None:
+    bench = Bench()
+
+    def announced() -> list[Status]:
+        out = [decode(Status, o.payload) for o in bench.published if o.leaf is Leaf.MOTION]
+        bench.published.clear()
+        return out
+
+    def moved(number: int, pattern: Any, ticks: int) -> None:
+        bench.acquire()
+        assert bench.move(number, pattern).accepted
+        for _ in range(ticks // 50):
+            bench.renew()
+            bench.ticks(50)
+
+    assert announced() == []
+    moved(1, ConstantMotion(velocity_rad_s=0.1, duration_s=0.5, ramp_s=0.1), 1000)
+    statuses = announced()
+    outcomes = [status.motion.outcome for status in statuses if status.motion is not None]
+    assert outcomes[0] == "running"
+    assert outcomes[-1] == "done"
+    # Neither more nor less than what everyone hears at that time.
+    assert len(statuses) == len({status.seq for status in statuses}) >= 3
+    bench.ticks(10_000)
+    times = [status.t_ns for status in announced()]
+    assert 4_000 * MS < times[-1] - times[0] < 5_000 * MS
+    # How a joint goes from one motion to the next is of no interest to the others.
+    moved(2, GoTo(target_rad=0.3, max_speed_rad_s=1.0), 500)
+    assert announced() == []
