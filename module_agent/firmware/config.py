@@ -7,11 +7,15 @@ from module_agent.model.catalogue import ImuKind, ModuleType, module_type
 from module_agent.model.errors import UsageError
 from module_agent.wire.messages import ExpiryAction, Limits
 
+# What a message carries.
+MAX_NAME = 64
+
 
 class FirmwareConfig(NamedTuple):
     """The settings of one module's firmware; times and rates in the module's own clock.
 
     imu: how well the module's IMU is calibrated, the prior of the module's own estimates.
+    name, family: what the module's user calls it, and all modules of its robot.
     """
 
     serial: str
@@ -27,6 +31,8 @@ class FirmwareConfig(NamedTuple):
     expiry_action: ExpiryAction = "motor_off"
     strategy: int = 3
     imu: ImuKind = "uncalibrated"
+    name: str = ""
+    family: str = ""
 
     @property
     def history_rows(self) -> int:
@@ -41,7 +47,8 @@ def config_of(module: ModuleInformation, boot: int, **settings: Any) -> Firmware
         UnknownModuleType: the catalogue has no such type.
     """
     kind, periods = module_type(module.module_type), (module.tick_ns, module.imu_period_ns)
-    return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **settings)
+    names = {"name": module.name[:MAX_NAME], "family": module.family[:MAX_NAME]}
+    return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **names | settings)
 
 
 def check_config(config: FirmwareConfig) -> FirmwareConfig:

@@ -30,6 +30,7 @@ from module_agent.wire.messages import (
     GainsCommand,
     GainSet,
     HistoryRequest,
+    Identify,
     Info,
     LeaseRequest,
     MotionCommand,
@@ -133,7 +134,8 @@ class Firmware:
         self._status_due_ns = 0
         self._note = ""
         modules.set_lifetime(index, config.lifetime_ns)
-        self._apply_gains(default_gains(config.kind, config.strategy))
+        self._kept_gains = default_gains(config.kind, config.strategy)
+        self._apply_gains(self._kept_gains)
 
     def step(self, sample: ModuleSample, inbox: Sequence[Incoming]) -> Command:
         """Begin a tick: expire what is stale, read the inbox; return the command for the module."""
@@ -263,7 +265,7 @@ class Firmware:
     def _end_lease(self) -> None:
         """End the lease and with it the gains of its holder: the next one shall not inherit them."""
         self.lease.release()
-        self._apply_gains(default_gains(self.config.kind, self.config.strategy))
+        self._apply_gains(self._kept_gains)
         self._status_due_ns = 0
 
     def _stop(self, note: str) -> None:
@@ -338,6 +340,8 @@ class Firmware:
                 self._stream(message)
             case GainsCommand():
                 self._set_gains(message)
+            case Identify():
+                self._modules.identify(self._index, message.on)
             case _:
                 raise WireError(Refusal.MALFORMED, f"{incoming.leaf.value} is not answered by the firmware")
         return encode(self._ack(message.seq))
@@ -425,6 +429,8 @@ class Firmware:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "gains are taken when no motion is running")
         check_gains(command.gains)
+        if command.keep:
+            self._kept_gains = command.gains
         self._apply_gains(command.gains)
         self._refresh(command.echo_ns)
 

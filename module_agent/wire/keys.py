@@ -29,6 +29,7 @@ class Leaf(StrEnum):
     LEASE = "lease"
     STOP = "stop"
     GAINS = "gains"
+    IDENTIFY = "identify"
     COLLECT = "collect"
     INFORMATION = "information"
 

@@ -195,7 +195,10 @@ class Limits(Part):
 
 
 class Info(Message):
-    """Type, limits, gains and rates of a module. Answer to an `Ask` on `info`."""
+    """Type, limits, gains and rates of a module. Answer to an `Ask` on `info`.
+
+    Its user gives a module its name, and the same family to all of one robot.
+    """
 
     module_type: Name
     firmware: Name
@@ -209,6 +212,8 @@ class Info(Message):
     limits: Limits
     gains: GainSet
     t_ns: Nanoseconds
+    name: Name = ""
+    family: Name = ""
 
 
 class Feedback(Message):
@@ -392,12 +397,23 @@ class Stop(Message):
 
 
 class GainsCommand(Message):
-    """Replace the gains; needs the lease and no motion. The gains in force are part of `Info`."""
+    """Replace the gains; needs the lease and no motion. The gains in force are part of `Info`.
+
+    They end with the lease, or with the boot if the module is to `keep` them.
+    """
 
     sender: Name
     token: Counter
     echo_ns: Nanoseconds
     gains: GainSet
+    keep: bool = False
+
+
+class Identify(Message):
+    """Show by its LED which module this is, or show it no longer. Needs no lease."""
+
+    sender: Name
+    on: bool
 
 
 # What the holder of a lease sends: checked for lease, proof, sequence and age.

@@ -18,6 +18,7 @@ from module_agent.wire.messages import (
     Feedback,
     GainsCommand,
     HistoryRequest,
+    Identify,
     Info,
     LeaseRequest,
     Message,
@@ -97,6 +98,9 @@ TOPICS: dict[Leaf, Topic] = {
         any_boot=True,
     ),
     Leaf.GAINS: Topic("Replace the controller's gains.", request=GainsCommand),
+    Leaf.IDENTIFY: Topic(
+        "Show by its LED which module this is; needs no lease.", request=Identify, any_boot=True
+    ),
     Leaf.ESTIMATE: Topic(
         "The module's own estimate of the motion of one joint.",
         publication=Estimate,

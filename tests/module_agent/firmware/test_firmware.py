@@ -29,6 +29,7 @@ from module_agent.wire.messages import (
     GainSet,
     GoTo,
     HistoryRequest,
+    Identify,
     Info,
     LeaseRequest,
     Message,
@@ -76,6 +77,10 @@ class Bench:
         self.pwm, out = self._wired.tick(sample, incoming, self.m_stop)
         self.published += [o for o in out if isinstance(o, Publication)]
         return [o.payload for o in out if isinstance(o, Answer)]
+
+    @property
+    def identified(self) -> tuple[str, ...]:
+        return self._wired.modules.identified
 
     @property
     def gains(self) -> GainSet:
@@ -532,6 +537,29 @@ def test_gains_end_with_the_lease_of_their_sender() -> None:
     assert bench.gains == stiff
     assert bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))).accepted
     assert bench.gains == factory
+
+
+def test_gains_that_a_module_is_to_keep_outlive_the_lease_and_the_next_ones_do_not() -> None:
+    bench = Bench()
+    bench.acquire()
+    loop = bench.gains.position
+    soft, stiff = (
+        bench.gains.model_copy(update={"position": loop.model_copy(update={"kp": kp})}) for kp in (0.2, 6.0)
+    )
+    assert bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=soft, keep=True))).accepted
+    assert bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=stiff))).accepted
+    assert bench.gains == stiff
+    assert bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))).accepted
+    assert bench.gains == soft
+
+
+def test_a_module_shows_which_one_it_is_without_a_lease_and_stays_idle() -> None:
+    bench = Bench()
+    for on, marked in ((True, ("A",)), (False, ())):
+        message = Identify(serial="A", boot=0, seq=1, sender="anybody", on=on)
+        assert bench.ask(Leaf.IDENTIFY, message).accepted
+        assert bench.identified == marked
+    assert bench.firmware.state == "idle"
 
 
 SEND: dict[Leaf, Callable[[Bench], Message]] = {

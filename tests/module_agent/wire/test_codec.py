@@ -38,6 +38,7 @@ from module_agent.wire.messages import (
     GainsCommand,
     GainSet,
     HistoryRequest,
+    Identify,
     Info,
     LeaseRequest,
     Limits,
@@ -117,6 +118,7 @@ EXAMPLES: list[Message] = [
     Setpoint(**COMMAND, position_rad=0.5, velocity_rad_s=None, effort_nm=1.25),
     Stop(**HEAD, sender="anybody", why="test"),
     GainsCommand(**COMMAND, gains=GAINS),
+    Identify(**HEAD, sender="coordinator-1@host", on=True),
     Info(
         **HEAD,
         module_type="X5-9",
@@ -131,6 +133,8 @@ EXAMPLES: list[Message] = [
         limits=Limits(max_speed_rad_s=1.4, max_effort_nm=13.0, min_position_rad=None, max_position_rad=None),
         gains=GAINS,
         t_ns=5,
+        name="elbow",
+        family="arm",
     ),
     Feedback(**HEAD, first_row=100, count=2, rows=rows(2).tobytes()),
     Status(
@@ -256,6 +260,13 @@ def test_the_bytes_of_an_effort_that_is_fed_forward_are_the_committed_ones() -> 
 def test_a_motion_without_the_field_effort_has_no_effort() -> None:
     golden = bytes.fromhex(json.loads(GOLDEN.read_text())["MotionCommand without effort"])
     assert decode(MotionCommand, golden).effort is None
+
+
+def test_messages_of_before_names_and_kept_gains_are_read() -> None:
+    golden = json.loads(GOLDEN.read_text())
+    info = decode(Info, bytes.fromhex(golden["Info without name"]))
+    assert (info.name, info.family) == ("", "")
+    assert not decode(GainsCommand, bytes.fromhex(golden["GainsCommand without keep"])).keep
 
 
 def test_the_longest_effort_and_the_longest_pattern_fit_a_command() -> None:
