@@ -16,7 +16,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,8 @@ from scipy.spatial.transform import RigidTransform
 from coordinator.description.denavit_hartenberg import DhPath, dh_paths
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
+from coordinator.export.exported_run import ExportedRun, exported
+from coordinator.export.frames import instants_frame, samples_frame
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
 from coordinator.live_robot.connection import Place, new_sender, open_connection
@@ -34,17 +36,19 @@ from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, SESSION
 from coordinator.recording.run_folder import load_recording as read_recording
-from coordinator.synchronisation.round_trips import map_clocks
+from coordinator.synchronisation.signals import Signals
 from coordinator.torque_control.gravity_model import gravity_model_of_result, read_result
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import LostError
 from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
-from module_agent.signals.clock_map import ClockMap
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import Feedback, GoTo, Message
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _STEP = 1e-6
 _NS = 1e-9
@@ -53,32 +57,6 @@ _NS = 1e-9
 _RETAINED_ROWS, _RETAINED_TRIPS = 150_000, 10_000
 # Feedback is published whether a module is held or not; a network may lose some.
 _FEEDBACK_S = 3.0
-
-
-class Signals(NamedTuple):
-    """What one module reported, in the order of time; m samples.
-
-    t_s, imu_t_s: (m,) time since the recording began, the module's clock mapped to the session's; encoder and
-    torque are sampled at t_s, the IMU at imu_t_s. Commands are NaN where a loop is off. gyro_rad_s and
-    accel_m_s2 (specific force) are (m, 3) in the IMU's frame, all others (m,).
-    """
-
-    t_s: Array
-    imu_t_s: Array
-    position_rad: Array
-    velocity_rad_s: Array
-    effort_nm: Array
-    position_command_rad: Array
-    velocity_command_rad_s: Array
-    effort_command_nm: Array
-    pwm: Array
-    deflection_rad: Array
-    motor_velocity_rad_s: Array
-    motor_current_a: Array
-    winding_temperature_c: Array
-    voltage_v: Array
-    gyro_rad_s: Array
-    accel_m_s2: Array
 
 
 class HeldOutTorques(NamedTuple):
@@ -123,12 +101,8 @@ class SavedRun:
         return load_recording(self.folder)
 
     @cached_property
-    def _clocks(self) -> dict[str, ClockMap]:
-        return map_clocks({s: self.recording.modules[s].trips for s in self.serials})
-
-    @property
-    def _start_ns(self) -> int:
-        return min(event.t_ns for event in self.recording.journal)
+    def _exported(self) -> ExportedRun:
+        return exported(self.recording, None, [])
 
     def signals(self, serial: str) -> Signals:
         """Return all samples of a module on the session's time base.
@@ -138,14 +112,21 @@ class SavedRun:
         """
         if serial not in self.serials:
             raise KeyError(f"{self.folder} has no module {serial!r}, but {', '.join(self.serials)}")
-        log, clock = self.recording.modules[serial].rows, self._clocks[serial]
-        rows = log.rows(log.first_row, log.end_row)
-        times = {
-            name: _NS * (clock.to_session(rows[source]) - self._start_ns).astype(float)
-            for name, source in (("t_s", "t_ns"), ("imu_t_s", "imu_t_ns"))
-        }
-        values = {name: rows[name].astype(float) for name in Signals._fields if name not in times}
-        return Signals(**times, **values)
+        return self._exported.signals[serial]
+
+    def frame(self, rate_hz: float | None = None) -> "DataFrame":
+        """Return everything that all modules reported as a pandas DataFrame, clocks applied.
+
+        Args:
+            rate_hz: None for a row for each sample as it was measured, with the column `module`; otherwise a
+                row for each of so many instants a second, interpolated, with columns like
+                `elbow.position_rad`.
+
+        Raises:
+            MissingPackage: pandas is not installed.
+            UsageError: no rate.
+        """
+        return samples_frame(self._exported) if rate_hz is None else instants_frame(self._exported, rate_hz)
 
     @cached_property
     def held_out(self) -> HeldOutTorques | None:
@@ -154,7 +135,7 @@ class SavedRun:
         if not path.is_file():
             return None
         with np.load(path) as data:
-            t_s = _NS * (data["session_ns"] - self._start_ns).astype(float)
+            t_s = _NS * (data["session_ns"] - self._exported.start_ns).astype(float)
             arrays = (data["q_rad"], data["tau_measured_nm"], data["tau_predicted_nm"])
             return HeldOutTorques(tuple(map(str, data["serials"])), t_s, *arrays)
 

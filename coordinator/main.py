@@ -6,6 +6,7 @@ COMMANDS = {
     "run": ("run.run", "Identify a robot: topology, kinematic chain and inertia."),
     "replay": ("run.replay", "Compute a run's result again from its recording."),
     "report": ("report.report", "Write the report of a run for people."),
+    "export": ("export.export", "Write a run as a table, for ROS 2 or for Foxglove."),
     "list": ("list_modules.list_modules", "List the modules on the network."),
     "stop": ("list_modules.stop", "Stop every module of a robot at once."),
     "keys": ("keys.keys", "Make the keys and certificates for --secure."),

@@ -31,6 +31,7 @@ from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.name: path.read_text() for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
+PAGES_WITH_COMMANDS = ["guide.md", "benchmarks.md", "security.md", "scale.md", "export.md"]
 SCRIPTS = Path(sys.executable).parent
 # What a first-time user waits for at most; each of these takes well under a minute on two cores.
 PATIENCE_S = 240
@@ -82,7 +83,7 @@ def environment() -> dict[str, str]:
 
 @pytest.mark.integration
 @pytest.mark.xdist_group("integration")
-@pytest.mark.parametrize("page", ["guide.md", "benchmarks.md", "security.md", "scale.md"])
+@pytest.mark.parametrize("page", PAGES_WITH_COMMANDS)
 def test_all_commands_of_a_page_succeed_one_after_the_other(
     page: str, tmp_path: Path, background: "list[subprocess.Popen[bytes]]"
 ) -> None:
@@ -136,7 +137,7 @@ def check_promised_files(run: Path) -> None:
 def test_every_shell_block_is_run() -> None:
     """Blocks of other pages hold only `make` commands, which take minutes: CI runs each of them as it is."""
     ci = (ROOT / ".ci" / "run").read_text()
-    for page in PAGES.keys() - {"guide.md", "benchmarks.md", "security.md", "scale.md"}:
+    for page in PAGES.keys() - set(PAGES_WITH_COMMANDS):
         for line in (line for block in blocks("sh", page) for line in commands(block)):
             assert re.search(rf"^{line}$", ci, flags=re.MULTILINE), f"{page}: CI does not run `{line}`"
 

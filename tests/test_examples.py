@@ -68,6 +68,23 @@ def test_poses_are_printed_with_their_sigmas(tmp_path: Path, folder: Path) -> No
     assert "not observable" in printed
 
 
+def test_the_largest_effort_of_every_motion_is_printed(tmp_path: Path, folder: Path) -> None:
+    printed = run(tmp_path, "effort_by_motion.py", str(folder))
+    motions = load_run(folder).recording.motions("windowed_sine")
+    for event in motions:
+        assert event.motion is not None
+        assert re.search(rf"^.*\b{event.motion.motion_id}\b.*\d\.\d+$", printed, flags=re.MULTILINE)
+    assert len(motions) >= 2
+
+
+def test_a_run_is_a_data_frame_in_one_line(folder: Path) -> None:
+    frame = load_run(folder).frame()
+    signals = load_run(folder).signals("X-00010")
+    of_module = frame[frame["module"] == "X-00010"]
+    np.testing.assert_array_equal(of_module["position_rad"], signals.position_rad)
+    np.testing.assert_array_equal(of_module["t_s"], signals.t_s)
+
+
 def test_gravity_torques_are_printed_over_a_turn_of_a_joint(tmp_path: Path, folder: Path) -> None:
     assert len(run(tmp_path, "gravity_torques.py", str(folder), "X-00010").splitlines()) == 10
 

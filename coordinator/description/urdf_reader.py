@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
-from xml.etree.ElementTree import Element, ParseError, parse
+from xml.etree.ElementTree import Element, ParseError, fromstring, parse
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,8 @@ from module_agent.model.errors import UsageError
 from module_agent.model.read_only import make_read_only, read_only
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
+# What is before a module's serial in the URDF of a run: name of its joint, and of its IMU's frame.
+URDF_JOINT, URDF_IMU = "joint_", "imu_"
 _MOVING, _FIXED = ("revolute", "continuous"), ("fixed", "prismatic")
 
 
@@ -76,7 +78,12 @@ class PlacedLink(NamedTuple):
     body: int
 
 
-class _Joint(NamedTuple):
+class UrdfJoint(NamedTuple):
+    """A joint: pose (4, 4) of the child's frame in the parent's at zero, axis (3,) in the child's.
+
+    moves: whether it turns. limits: position, speed and effort. held: position of a joint taken as fixed.
+    """
+
     name: str
     parent: str
     child: str
@@ -115,6 +122,20 @@ def read_urdf(
         raise UrdfError(f"{path}: {error}") from None
 
 
+def read_joints(text: str) -> tuple[UrdfJoint, ...]:
+    """Return the joints of a URDF's text in the file's order.
+
+    Raises:
+        UrdfError: no XML, or a joint that `read_urdf` would not read either.
+    """
+    try:
+        root = fromstring(text)
+    except ParseError as error:
+        raise UrdfError(f"not XML: {error}") from None
+    links = {_name(link): link for link in root.findall("link")}
+    return tuple(_joint(element, links, _NOTHING) for element in root.findall("joint"))
+
+
 def _robot(root: Element, gravity: Array, held: Mapping[str, float]) -> UrdfRobot:
     links = {_name(link): link for link in root.findall("link")}
     joints = [_joint(element, links, held) for element in root.findall("joint")]
@@ -149,7 +170,7 @@ def _robot(root: Element, gravity: Array, held: Mapping[str, float]) -> UrdfRobo
     )
 
 
-def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float]) -> _Joint:
+def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float]) -> UrdfJoint:
     name, kind = _name(element), element.get("type", "")
     if kind not in (*_MOVING, *_FIXED):
         raise UrdfError(
@@ -172,14 +193,14 @@ def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float
     pose = element_pose(element.find("origin"), f"origin of joint {name!r}")
     axis, limits = axis / max(length, 1e-9), _limits(element, name, kind)
     if kind == "fixed" or (kind in _MOVING and name not in held and element.find("mimic") is None):
-        return _Joint(name, ends[0], ends[1], kind in _MOVING, pose, axis, limits, None)
+        return UrdfJoint(name, ends[0], ends[1], kind in _MOVING, pose, axis, limits, None)
     position = float(held.get(name, 0.0))
     displaced = np.eye(4)
     if kind == "prismatic":
         displaced[:3, 3] = position * axis
     else:
         displaced[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
-    return _Joint(name, ends[0], ends[1], False, pose @ displaced, axis, limits, position)
+    return UrdfJoint(name, ends[0], ends[1], False, pose @ displaced, axis, limits, position)
 
 
 def _drives(root: Element, names: Sequence[str]) -> Array:
@@ -218,7 +239,7 @@ def _limits(element: Element, name: str, kind: str) -> tuple[float, float, float
     return low, high, speed if speed > 0.0 else np.inf, effort if effort > 0.0 else np.inf
 
 
-def _root_link(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
+def _root_link(joints: Sequence[UrdfJoint], links: dict[str, Element]) -> str:
     children = [joint.child for joint in joints]
     if twice := [link for link in children if children.count(link) > 1]:
         raise UrdfError(f"link {twice[0]!r} is the child of several joints; a tree is needed")
@@ -230,9 +251,9 @@ def _root_link(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
     return roots[0]
 
 
-def _placed(joints: Sequence[_Joint], root_link: str) -> tuple[list[_Joint], dict[str, PlacedLink]]:
+def _placed(joints: Sequence[UrdfJoint], root_link: str) -> tuple[list[UrdfJoint], dict[str, PlacedLink]]:
     """Return the moving joints in the file's order, but parents before children, and all links' places."""
-    placed, waiting, moving = {root_link: PlacedLink(np.eye(4), BASE)}, list(joints), list[_Joint]()
+    placed, waiting, moving = {root_link: PlacedLink(np.eye(4), BASE)}, list(joints), list[UrdfJoint]()
     while waiting:
         joint = next((one for one in waiting if one.parent in placed), None)
         if joint is None:

@@ -74,6 +74,11 @@ class Terminal(Displayed):
         self._task = self._progress.add_task("starting", total=None)
         super().__init__(console, self._progress)
 
+    def progress(self, done: int, total: int, text: str) -> None:
+        """Show how much of a step is done; in a pipe nothing is shown."""
+        if self._display is not None:
+            self._progress.update(self._task, description=text, completed=done, total=total)
+
     def step(self, index: int, total: int, text: str) -> None:
         """Show that a step begins."""
         if self._display is not None:

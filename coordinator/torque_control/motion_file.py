@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from coordinator.description.urdf_reader import URDF_JOINT
 from coordinator.torque_control.feed_forward import RATE_HZ, Reference
 from module_agent.model.chain import Array
 from module_agent.model.errors import UsageError
@@ -23,8 +24,6 @@ from module_agent.model.read_only import read_only
 MAX_END_SPEED_RAD_S = 0.1
 MAX_MOTION_S = 600.0
 MIN_SAMPLES = 4
-# Before the serial in the URDF of a run.
-URDF_JOINT = "joint_"
 _TIME = "t_s"
 _POSITION = re.compile(r"q_(.+)_rad")
 
