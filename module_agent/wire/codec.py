@@ -10,7 +10,15 @@ from typing import Any, TypeVar
 import msgpack
 from pydantic import ValidationError
 
-from module_agent.wire.messages import COMMANDS, SCHEMA_VERSION, Message
+from module_agent.wire.messages import (
+    COMMANDS,
+    MAX_BATCH_ROWS,
+    MAX_NAME,
+    MAX_ROWS_BYTES,
+    SCHEMA_VERSION,
+    Feedback,
+    Message,
+)
 from module_agent.wire.proof import is_proof
 from module_agent.wire.refusal import Refusal, WireError
 
@@ -20,6 +28,7 @@ MAX_DEPTH = 6
 
 M = TypeVar("M", bound=Message)
 
+_FEEDBACK = tuple(Feedback.model_fields)
 # The types of maps and arrays from `unpackb`.
 _CONTAINERS = (dict, tuple)
 _RANGE_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
@@ -80,6 +89,39 @@ def _reason(error: ValidationError) -> WireError:
     return WireError(reason, f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:480])
 
 
+def _feedback(data: bytes, max_bytes: int) -> Feedback | None:
+    """Return the message if it is a valid `Feedback`, None if the general way has to say what it is.
+
+    Feedback is nine messages of ten: its few fields are checked by hand, in a third of the time.
+    """
+    if len(data) > max_bytes:
+        return None
+    try:
+        value = msgpack.unpackb(data, max_array_len=0, max_map_len=len(_FEEDBACK), max_ext_len=0)
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):
+        return None
+    if type(value) is not dict or len(value) != len(_FEEDBACK):
+        return None
+    try:
+        v, serial, boot, seq, first, count, rows = map(value.__getitem__, _FEEDBACK)
+    except KeyError:
+        return None
+    valid = (
+        type(v) is type(boot) is type(seq) is type(first) is type(count) is int
+        and v == SCHEMA_VERSION
+        and type(serial) is str
+        and type(rows) is bytes
+        and len(serial) <= MAX_NAME
+        and len(rows) <= MAX_ROWS_BYTES
+        # msgpack has no larger integers than those of 64 bits.
+        and boot >= 0
+        and 0 <= seq < 2**63
+        and 0 <= first < 2**63
+        and 0 <= count <= MAX_BATCH_ROWS
+    )
+    return Feedback.checked(value) if valid else None
+
+
 def decode(kind: type[M], data: bytes, max_bytes: int = MAX_COMMAND_BYTES) -> M:
     """Return the message of type `kind` that `data` holds; a proof may follow a command, and is not checked.
 
@@ -87,6 +129,8 @@ def decode(kind: type[M], data: bytes, max_bytes: int = MAX_COMMAND_BYTES) -> M:
         WireError: the bytes are too long, malformed, of another schema version, or hold a field of the wrong
             type, a value that is not finite, or one out of range; the reason says which.
     """
+    if kind is Feedback and (feedback := _feedback(data, max_bytes)) is not None:
+        return feedback  # type: ignore[return-value]
     value = _unpack(data, max_bytes, issubclass(kind, COMMANDS))
     version = value.get("v")
     if version != SCHEMA_VERSION:

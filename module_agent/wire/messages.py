@@ -5,7 +5,7 @@ boot id; a command carries the boot id of the module it is meant for, so that it
 Unknown fields are ignored; another schema version is refused by name.
 """
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -14,7 +14,8 @@ SCHEMA_VERSION = 1
 
 Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 Counter = Annotated[int, Field(ge=0, lt=2**63)]
-Name = Annotated[str, Field(max_length=64)]
+MAX_NAME = 64
+Name = Annotated[str, Field(max_length=MAX_NAME)]
 Text = Annotated[str, Field(max_length=512)]
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -22,9 +23,15 @@ Vector3 = tuple[Finite, Finite, Finite]
 
 # Of a module in one motion: 400 s at 250 Hz.
 MAX_ROWS_PER_MOTION = 100_000
+# Of one feedback message.
+MAX_BATCH_ROWS, MAX_ROWS_BYTES = 512, 65536
 
 State = Literal["idle", "armed", "moving", "streaming", "expired", "stopped", "fault"]
 ExpiryAction = Literal["motor_off", "hold", "damping"]
+
+
+# Frozen models have no other way in.
+_set = object.__setattr__
 
 
 class Part(BaseModel):
@@ -223,8 +230,24 @@ class Feedback(Message):
     """
 
     first_row: Counter
-    count: Annotated[int, Field(ge=0, le=512)]
-    rows: Annotated[bytes, Field(max_length=65536)]
+    count: Annotated[int, Field(ge=0, le=MAX_BATCH_ROWS)]
+    rows: Annotated[bytes, Field(max_length=MAX_ROWS_BYTES)]
+
+    @classmethod
+    def checked(cls, fields: dict[str, Any]) -> Self:
+        """Return the message with these fields, which the caller has checked: all of them, and no others.
+
+        `model_construct` does the same in twice the time of all other decoding.
+        """
+        message = cls.__new__(cls)
+        _set(message, "__dict__", fields)
+        _set(message, "__pydantic_fields_set__", _FEEDBACK_FIELDS)
+        _set(message, "__pydantic_extra__", None)
+        _set(message, "__pydantic_private__", None)
+        return message
+
+
+_FEEDBACK_FIELDS = set(Feedback.model_fields)
 
 
 class Status(Message):

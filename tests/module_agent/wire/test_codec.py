@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from module_agent.control.motion import MAX_SAMPLES, effort_profile
 from module_agent.model.errors import UsageError
@@ -436,3 +437,46 @@ def test_a_name_that_cannot_stand_in_a_key_is_refused(name: str) -> None:
 def test_a_foreign_key_is_refused(text: str) -> None:
     with pytest.raises(WireError, match="not a key"):
         keys.parse(text)
+
+
+class ReadByTheModel(Feedback):
+    """The same fields; only `Feedback` itself is read by hand."""
+
+
+_WRONG = st.one_of(
+    st.integers(-(2**63), 2**64 - 1),
+    st.sampled_from(
+        [0, 1, 2, 512, 513, 2**63 - 1, 2**63, True, None, 1.0, "1", "x" * 64, "x" * 65, b"", {}, []]
+    ),
+    st.binary(max_size=8),
+)
+
+
+@given(
+    changes=st.dictionaries(st.sampled_from([*Feedback.model_fields, "more"]), _WRONG, max_size=3),
+    missing=st.sets(st.sampled_from([*Feedback.model_fields]), max_size=1),
+    cut=st.sampled_from([None, None, None, -1, 3]),
+)
+def test_feedback_read_by_hand_is_what_the_model_says(
+    changes: dict[str, Any], missing: set[str], cut: int | None
+) -> None:
+    def outcome(kind: type[Feedback]) -> dict[str, Any] | tuple[Refusal, str]:
+        try:
+            return decode(kind, data, MAX_MESSAGE_BYTES).model_dump()
+        except WireError as error:
+            return error.reason, error.detail
+
+    good = {"v": 1, "serial": "A", "boot": 7, "seq": 3, "first_row": 5, "count": 1, "rows": bytes(101)}
+    fields = {name: value for name, value in (good | changes).items() if name not in missing}
+    data = msgpack.packb(fields)[:cut]
+    assert outcome(Feedback) == outcome(ReadByTheModel)
+
+
+def test_feedback_read_by_hand_is_a_message_like_any_other() -> None:
+    message = Feedback(serial="A", boot=2**64 - 1, seq=3, first_row=5, count=1, rows=bytes(101))
+    read = decode(Feedback, encode(message), MAX_MESSAGE_BYTES)
+    assert read == message
+    assert hash(read) == hash(message)
+    assert read.model_copy(update={"seq": 4}).seq == 4
+    with pytest.raises(ValidationError, match="frozen"):
+        read.seq = 5  # type: ignore[misc]
