@@ -120,13 +120,6 @@ def known_folder(tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture(scope="session")
 def quick_plan() -> Plan:
     """Half the thesis' durations: enough for topology, kinematics and every fault."""
-    return Plan(
-        dynamics=False,
-        discover_s=0.3,
-        link_s=0.3,
-        settle_s=0.3,
-        rest_s=1.0,
-        travel_speed_rad_s=1.5,
-        sine_centre_s=1.2,
-        sine_sigma_s=0.5,
-    )
+    from sim.virtual_time.run import QUICK_PLAN
+
+    return QUICK_PLAN

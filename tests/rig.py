@@ -1,6 +1,5 @@
 """A simulated robot in virtual time, every module an agent process of its own, to be broken at will."""
 
-import asyncio
 import itertools
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from coordinator.identification.result import Result
 from coordinator.live_robot.messenger import Messenger, Sender
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Recording
+from coordinator.runtime.event_loop import end_tasks
 from coordinator.session.run import Run, RunConfig
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from sim.robot.robot_file import load_robot
@@ -145,14 +145,7 @@ class Rig(VirtualRobot):
 
     def end_tasks(self) -> None:
         """End what a killed coordinator has left behind, as the end of its process would."""
-        left = sorted(asyncio.all_tasks(self.loop), key=lambda task: task.get_name())
-
-        async def end() -> None:
-            for task in left:
-                task.cancel()
-            await asyncio.gather(*left, return_exceptions=True)
-
-        self.loop.run_until_complete(end())
+        end_tasks(self.loop)
 
     def close(self) -> None:
         self.stop()

@@ -82,16 +82,21 @@ class Interruption:
             self._loop.call_soon(self._task.cancel, "interrupted")
 
 
+def end_tasks(loop: asyncio.AbstractEventLoop) -> None:
+    """Cancel the tasks of a loop that does not run, and await their end."""
+    remaining = sorted(asyncio.all_tasks(loop), key=lambda each: each.get_name())
+    for each in remaining:
+        each.cancel()
+    if remaining:
+        loop.run_until_complete(asyncio.gather(*remaining, return_exceptions=True))
+
+
 def run_to_end(loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]") -> T:
     """Run a task, then cancel and await its remaining tasks; return its result or raise its error."""
     try:
         return loop.run_until_complete(task)
     finally:
-        remaining = sorted(asyncio.all_tasks(loop), key=lambda each: each.get_name())
-        for each in remaining:
-            each.cancel()
-        if remaining:
-            loop.run_until_complete(asyncio.gather(*remaining, return_exceptions=True))
+        end_tasks(loop)
 
 
 def attend(

@@ -22,6 +22,17 @@ from sim.world.truth import write_truth
 
 COORDINATOR = "coordinator"
 SENDER = Sender(COORDINATOR, b"virtual-secret-1")
+# Half the thesis' durations: enough for topology, kinematics and every fault.
+QUICK_PLAN = Plan(
+    dynamics=False,
+    discover_s=0.3,
+    link_s=0.3,
+    settle_s=0.3,
+    rest_s=1.0,
+    travel_speed_rad_s=1.5,
+    sine_centre_s=1.2,
+    sine_sigma_s=0.5,
+)
 
 
 class VirtualConfig(NamedTuple):

@@ -26,7 +26,7 @@ from coordinator.report.result_sections import HALF_95
 from coordinator.report.run_report import MAX_BARS, read_run, run_report, step_bars
 from module_agent.model.chain import Chain
 from sim.robot.robot_file import load_robot
-from sim.virtual_time.run import VirtualConfig, run_virtual
+from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from tests.random_chains import random_robot
 
 ROBOT = "thesis_171_vertical"
@@ -38,16 +38,7 @@ pytestmark = pytest.mark.xdist_group("report")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run on an arm of two modules, dynamics included."""
     out = tmp_path_factory.mktemp("report") / "run"
-    plan = Plan(
-        discover_s=0.3,
-        link_s=0.3,
-        settle_s=0.3,
-        rest_s=1.0,
-        travel_speed_rad_s=1.5,
-        sine_centre_s=1.2,
-        sine_sigma_s=0.5,
-        dynamic_repeats=1,
-    )
+    plan = QUICK_PLAN.model_copy(update={"dynamics": True, "dynamic_repeats": 1})
     run_virtual(VirtualConfig(load_robot(ROBOT), out, seed=3, plan=plan, report=True))
     return out
 
