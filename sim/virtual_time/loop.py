@@ -61,6 +61,25 @@ class VirtualLoop(asyncio.BaseEventLoop):
         """Call `call` at a time [ns], at once if that has passed. The cheapest way; not to be cancelled."""
         self._push(due_ns, call, None)
 
+    def freeze_tasks(self, for_ns: int) -> None:
+        """Let a time [ns] pass in which no task, timer or ready call runs, as SIGSTOP of their process does.
+
+        What was given to `schedule_ns` goes on. To be called from such a call; timers run late, in order.
+        """
+        until_ns, late = self._now_ns + for_ns, list[_Entry]()
+        try:
+            while self._heap and self._heap[0][0] <= until_ns:
+                entry = heapq.heappop(self._heap)
+                if entry[3] is not None:
+                    late.append(entry)
+                    continue
+                self._now_ns = entry[0]
+                entry[2]()
+            self._now_ns = until_ns
+        finally:
+            for due_ns, _, call, timer in late:
+                self._push(due_ns, call, timer)
+
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> events.TimerHandle:

@@ -197,6 +197,16 @@ class World:
             raise ValueError(f"friction times {factor} is no friction; a number from 0 on is needed")
         self._actuators.change_friction(self.robot.serials.index(serial), factor)
 
+    def supply(self, voltage_v: float) -> None:
+        """Set the voltage of the modules' supply from the next tick on.
+
+        Raises:
+            ValueError: it is not positive and finite.
+        """
+        if not (math.isfinite(voltage_v) and voltage_v > 0.0):
+            raise ValueError(f"{voltage_v} V supply no motor; a positive voltage is needed")
+        self._actuators.voltage_v = voltage_v
+
     def step(self, pwm: Sequence[float]) -> list[SensorSample]:
         """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
 

@@ -246,3 +246,46 @@ def test_queues_and_tasks_interleave_the_same_way_every_time() -> None:
     first = run(main())
     assert len(first) == 150
     assert first == run(main())
+
+
+def test_frozen_tasks_stand_still_while_the_world_goes_on_and_then_run_late_in_order() -> None:
+    ran: list[tuple[str, int]] = []
+
+    async def main() -> None:
+        def note(name: str) -> None:
+            ran.append((name, loop().now_ns))
+
+        loop().schedule_ns(10, lambda: loop().freeze_tasks(100))
+        for due_ns in (5, 50, 90, 200):
+            loop().schedule_ns(due_ns, lambda due_ns=due_ns: note(f"world {due_ns}"))
+        loop().call_later(60e-9, note, "timer 60")
+        loop().call_later(40e-9, note, "timer 40")
+        loop().schedule_ns(20, lambda: loop().call_soon(note, "soon"))
+        await asyncio.sleep(150e-9)
+        note("task")
+        await asyncio.sleep(100e-9)
+
+    run(main())
+    assert ran == [
+        *(("world 5", 5), ("world 50", 50), ("world 90", 90)),
+        *(("soon", 110), ("timer 40", 110), ("timer 60", 110)),
+        *(("task", 150), ("world 200", 200)),
+    ]
+
+
+def test_what_ends_a_freeze_early_loses_no_timer() -> None:
+    async def main() -> None:
+        def fail() -> None:
+            raise ArithmeticError
+
+        loop().schedule_ns(10, lambda: loop().freeze_tasks(100))
+        loop().schedule_ns(50, fail)
+        await asyncio.sleep(20e-9)
+
+    frozen = VirtualLoop()
+    task = frozen.create_task(main())
+    with pytest.raises(ArithmeticError):
+        frozen.run_until_complete(task)
+    assert frozen.now_ns == 50
+    frozen.run_until_complete(task)
+    frozen.close()

@@ -67,3 +67,16 @@ def test_friction_is_changed_of_modules_that_are_there_and_to_what_it_can_be() -
         world.change_friction("absent", 2.0)
     with pytest.raises(ValueError, match="no friction"):
         world.change_friction(TIP, -1.0)
+
+
+def test_the_current_of_a_motor_at_rest_falls_with_its_supply() -> None:
+    full, sagged = World(ARM, 0, "ideal"), World(ARM, 0, "ideal")
+    sagged.supply(0.5 * full.step([0.0] * 3)[0].voltage_v)
+    sagged.step([0.0] * 3)
+    # The motor begins to turn within the tick: its voltage is a part in a thousand of the current.
+    before, after = full.step([1.0] * 3)[0], sagged.step([1.0] * 3)[0]
+    assert after.voltage_v == 0.5 * before.voltage_v
+    assert after.motor_current_a == pytest.approx(0.5 * before.motor_current_a, rel=0.01)
+    for voltage_v in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="a positive voltage"):
+            sagged.supply(voltage_v)
