@@ -154,11 +154,12 @@ def _work(pipe: Connection, folder: str) -> None:
         except EOFError:
             return
         start_s = time.process_time()
-        result = _result(trial)
+        result = run_trial(trial)
         pipe.send((result, time.process_time() - start_s))
 
 
-def _result(trial: Trial) -> Any:
+def run_trial(trial: Trial) -> Any:
+    """Run a trial and return its result, `Failed` if it raises."""
     try:
         return trial.work(*trial.arguments)
     except Exception as error:
