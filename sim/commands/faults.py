@@ -1,6 +1,7 @@
 """`x5-sim faults`: search by seeds for faults that the system does not survive."""
 
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -8,15 +9,19 @@ import typer
 from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import EXIT_FINDING, UsageError
 from module_agent.model.files import write_json
+from module_agent.network_emulation.profile_file import network as check_network
 from sim.benchmark.case import Failed, Trial
+from sim.benchmark.dask_cluster import run_trials_on
 from sim.benchmark.workers import run_trials
 from sim.commands.experiment import JsonFile, experiment, worker_count
 from sim.commands.options import load
+from sim.faults.fault import Fault, fault_of
 from sim.faults.report import OUTCOMES, SeedReport, by_fault, run_seed
+from sim.faults.schedule import Schedule, draw, first_modules
 
 _RANGE = re.compile(r"(\d{1,12})\.\.(\d{1,12})\Z")
 # Processor time of a seed [s].
-COST_S = 2.0
+COST_S = 3.0
 
 
 def faults(
@@ -24,8 +29,19 @@ def faults(
     robot: Annotated[
         str | None, typer.Option(help="A robot of `x5-sim robots`, or a file [small ones, drawn].")
     ] = None,
+    modules: Annotated[
+        int | None, typer.Option(min=2, help="Its first modules only [as many as drawn, or it has].")
+    ] = None,
+    network: Annotated[str | None, typer.Option(help="A network profile [drawn].")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="A fault, as a report prints it; repeat for more [drawn].")
+    ] = None,
+    shrink: Annotated[bool, typer.Option(help="Make what violates an invariant simpler.")] = True,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option(help="A Dask scheduler to work on instead, such as tcp://10.0.0.5:8786.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -34,23 +50,23 @@ def faults(
     Exit code 0 if no invariant is violated, 4 if one is, 2 for wrong usage, 130 if interrupted.
     """
     numbers = seed_range(seeds)
-    chosen = load(robot) if robot is not None else None
-    outcomes = _run([Trial(run_seed, (seed, chosen), COST_S) for seed in numbers], workers)
+    schedules = [_schedule(seed, robot, modules, network, fault) for seed in numbers]
+    trials = [Trial(run_seed, (schedule, shrink), COST_S) for schedule in schedules]
+    outcomes = _run(trials, workers, dask)
     reports = [one for one in outcomes if isinstance(one, SeedReport)]
     _print_table(reports)
     violated = 0
     for seed, one in zip(numbers, outcomes, strict=True):
-        if isinstance(one, SeedReport) and not one.violations:
-            continue
-        violated += 1
-        described = {"traceback": one.text} if isinstance(one, Failed) else one.violations
-        option = f" --robot {robot}" if robot is not None else ""
-        for kind, text in described.items():
-            typer.echo(f"seed {seed}: {kind}: {text}", err=True)
-        typer.echo(f"  repeat it with: x5-sim faults --seeds {seed}..{seed}{option}", err=True)
-    named = [one.named_module for one in reports if one.named_module is not None]
+        if isinstance(one, Failed):
+            typer.echo(f"seed {seed}: {one.text}", err=True)
+            violated += 1
+        elif one.violations:
+            typer.echo(described(one, robot), err=True)
+            violated += 1
+    named = [one.named_rightly for one in reports if one.named_rightly is not None]
     typer.echo(
-        f"{len(numbers)} seeds, {violated} with violations; {sum(named)} of {len(named)} lost modules named"
+        f"{len(numbers)} seeds, {violated} with violations; {sum(named)} of {len(named)} errors and "
+        "suspicions name what happened"
     )
     if json_file is not None:
         write_json(json_file, figures(numbers, outcomes))
@@ -70,28 +86,68 @@ def seed_range(text: str) -> range:
     return range(int(match[1]), int(match[2]) + 1)
 
 
-def figures(seeds: range, outcomes: list[Any]) -> dict[str, Any]:
+def described(report: SeedReport, robot: str | None = None) -> str:
+    """Return lines about a violation, with the commands that repeat it; `robot` as the user gave it."""
+    lines = [f"seed {report.seed}: {kind}: {text}" for kind, text in report.violations.items()]
+    lines.append(f"  repeat it with: x5-sim faults {report.options(robot)}")
+    simplest = report.simplest
+    if simplest is not None and simplest.options() != report.options():
+        lines.append(f"  or simpler:     x5-sim faults {simplest.options(robot)}")
+    return "\n".join(lines)
+
+
+def figures(seeds: range, outcomes: Sequence[Any]) -> dict[str, Any]:
     """Return the contents of the JSON file."""
     reports = [one for one in outcomes if isinstance(one, SeedReport)]
     return {
         "seeds": [seeds.start, seeds.stop - 1],
         "by_fault": {kind: dict(counted) for kind, counted in by_fault(reports).items()},
-        "tracebacks": {
-            s: one.text for s, one in zip(seeds, outcomes, strict=True) if isinstance(one, Failed)
-        },
-        "reports": [one._asdict() for one in reports],
+        "failed": {s: one.text for s, one in zip(seeds, outcomes, strict=True) if isinstance(one, Failed)},
+        "reports": [_document(one) for one in reports],
     }
 
 
-def _run(trials: list[Trial], workers: int | None) -> list[Any]:
+def _document(report: SeedReport) -> dict[str, Any]:
+    simplest = report.simplest
+    return report._asdict() | {"simplest": None if simplest is None else simplest._asdict()}
+
+
+def _schedule(
+    seed: int, robot: str | None, modules: int | None, network: str | None, faults: list[str] | None
+) -> Schedule:
+    chosen = None if robot is None else load(robot)
+    if chosen is not None and modules is not None:
+        chosen = first_modules(chosen, modules)
+    schedule = draw(seed, chosen)
+    if chosen is None and modules is not None:
+        schedule = draw(seed, first_modules(schedule.robot, modules))
+    if network is not None:
+        check_network(network)
+        schedule = schedule._replace(network=network)
+    if faults is not None:
+        given = sorted((fault_of(text) for text in faults), key=lambda fault: fault.at_s)
+        schedule = schedule._replace(faults=tuple(_of_robot(one, schedule) for one in given))
+    return schedule
+
+
+def _of_robot(fault: Fault, schedule: Schedule) -> Fault:
+    count = len(schedule.robot.modules)
+    if fault.module >= count:
+        raise UsageError(f"--fault {fault}: {schedule.robot.name} has modules 0 to {count - 1} here")
+    return fault
+
+
+def _run(trials: list[Trial], workers: int | None, dask: str | None) -> list[Any]:
     done = 0
     with experiment() as terminal:
 
         def show(index: int, result: Any) -> None:
             nonlocal done
             done += 1
-            terminal.step(done, len(trials), f"seed {trials[index].arguments[0]}")
+            terminal.step(done, len(trials), f"seed {trials[index].arguments[0].seed}")
 
+        if dask is not None:
+            return run_trials_on(dask, trials, show)
         return [each.result for each in run_trials(trials, worker_count(workers), show)]
 
 

@@ -1,37 +1,130 @@
-"""The faults that a simulated session can meet."""
+"""The faults that a simulated session can meet: one table says what each happens to, and how it is named."""
 
-from typing import Literal, NamedTuple, get_args
+import math
+import re
+from typing import Literal, NamedTuple
 
-Kind = Literal[
-    "agent crash",
-    "agent freeze",
-    "agent thaw",
-    "agent reboot",
-    "coordinator crash",
-    "coordinator restart",
-    "partition",
-    "corrupted messages",
-    "duplicated messages",
-    "delayed messages",
-]
-KINDS: tuple[Kind, ...] = get_args(Kind)
-OF_AN_AGENT: tuple[Kind, ...] = ("agent crash", "agent freeze", "agent thaw", "agent reboot")
-# After these a run cannot go on: the module is gone for good.
-LOSES_MODULE: tuple[Kind, ...] = ("agent crash", "agent freeze")
+from module_agent.model.errors import UsageError
+
+Part = Literal["agent", "coordinator", "clock", "encoder", "imu", "torque", "motor", "network", "disk"]
+
+
+class Nature(NamedTuple):
+    """What a kind of fault happens to, and how.
+
+    ends: a fault that is over after a time; "never" lasts to the end of the session, "either" is drawn.
+    words: one of them, in any case, is in a sentence that names the fault; () where the module's serial does.
+    """
+
+    part: Part
+    ends: Literal["after", "never", "either"] = "after"
+    words: tuple[str, ...] = ()
+
+
+_NETWORK = ("answer", "network", "slow", "late", "lost", "heard", "expired", "lease", "expected, found")
+_TIME = ("clock", "time", "expired", "lease")
+_POSITION = ("position", "encoder", "moved", "turn")
+_IMU = ("gyro", "accel", "imu", "specific force", "gravity")
+_TORQUE = ("effort", "torque")
+
+NATURES: dict[str, Nature] = {
+    "agent crash": Nature("agent", "never"),
+    "agent freeze": Nature("agent", "never"),
+    "agent thaw": Nature("agent"),
+    "agent reboot": Nature("agent"),
+    "twin": Nature("agent", "either", ("twice", "twin", "boot", "two")),
+    "hot plug": Nature("agent", "never"),
+    "hot unplug": Nature("agent", "never"),
+    "coordinator crash": Nature("coordinator", "never"),
+    "coordinator freeze": Nature("coordinator", "after", ("expired", "lease", "answer", "lost", "slow")),
+    "coordinator restart": Nature("coordinator", "never"),
+    "clock forward": Nature("clock", "never", _TIME),
+    "clock back": Nature("clock", "never", _TIME),
+    "clock stuck": Nature("clock", "after", _TIME),
+    "clock drift": Nature("clock", "either", _TIME),
+    "encoder stuck": Nature("encoder", "either", _POSITION),
+    "encoder jump": Nature("encoder", "never", _POSITION),
+    "encoder NaN": Nature("encoder", "either", _POSITION),
+    "IMU dead": Nature("imu", "either", _IMU),
+    "IMU stuck": Nature("imu", "either", _IMU),
+    "IMU saturated": Nature("imu", "either", _IMU),
+    "IMU NaN": Nature("imu", "either", _IMU),
+    "IMU swapped": Nature("imu", "never", _IMU),
+    "torque stuck": Nature("torque", "either", _TORQUE),
+    "torque NaN": Nature("torque", "either", _TORQUE),
+    "motor stall": Nature("motor", "either", ("moved", "motion", "stall", "follow")),
+    "overheating": Nature("motor", "never", ("winding", "temperature")),
+    "voltage sag": Nature("motor", "after", ("voltage", "moved", "motion", "follow")),
+    "partition": Nature("network", "after", _NETWORK),
+    "corrupted messages": Nature("network", "after", _NETWORK),
+    "duplicated messages": Nature("network", "after", _NETWORK),
+    "delayed messages": Nature("network", "after", _NETWORK),
+    "intruder": Nature("network", "after", (*_NETWORK, "GHOST")),
+    "disk full": Nature("disk", "after", ("disk", "space", "file", "write")),
+}
+KINDS = tuple(NATURES)
+OF_A_MODULE: tuple[Part, ...] = ("agent", "clock", "encoder", "imu", "torque", "motor")
+
+_TEXT = re.compile(
+    r"(?P<kind>.+?)(?: of module (?P<module>\d{1,3}))? "
+    r"(?:at (?P<at>\d{1,4}\.\d{3}) s for (?P<lasts>\d{1,4}\.\d{3}) s|from (?P<since>\d{1,4}\.\d{3}) s on), "
+    r"size (?P<size>0\.\d{3})\Z"
+)
 
 
 class Fault(NamedTuple):
-    """One fault: it begins at `at_s` of virtual time and lasts `for_s`, where it ends at all [s].
+    """One fault: it begins at `at_s` of virtual time and lasts `for_s`, infinite where it does not end [s].
 
-    module: the index of the module whose agent it happens to. byte: which byte of a message is corrupted.
+    module: the index of the module that it happens to. size: how large it is of its kind, in [0, 1): a jump,
+    a drop of the voltage, which byte is corrupted, which packets an intruder sends.
     """
 
-    kind: Kind
+    kind: str
     at_s: float
     for_s: float
     module: int = 0
-    byte: int = 0
+    size: float = 0.0
+
+    @property
+    def nature(self) -> Nature:
+        """The row of its kind in the table."""
+        return NATURES[self.kind]
+
+    @property
+    def of_a_module(self) -> bool:
+        """Whether it happens to one module."""
+        return self.nature.part in OF_A_MODULE
 
     def __str__(self) -> str:
-        where = f" of module {self.module}" if self.kind in OF_AN_AGENT else ""
-        return f"{self.kind}{where} at {self.at_s:.3f} s for {self.for_s:.3f} s"
+        where = f" of module {self.module}" if self.of_a_module else ""
+        when = (
+            f"from {self.at_s:.3f} s on"
+            if math.isinf(self.for_s)
+            else f"at {self.at_s:.3f} s for {self.for_s:.3f} s"
+        )
+        return f"{self.kind}{where} {when}, size {self.size:.3f}"
+
+    def is_named(self, text: str, serials: tuple[str, ...]) -> bool:
+        """Return whether a sentence names this fault: its words, and its module where it has one."""
+        said = text.lower()
+        words = not self.nature.words or any(word.lower() in said for word in self.nature.words)
+        # How many modules are missing, and which are there, names those that are not.
+        named = serials[self.module] in text or (self.nature.part == "agent" and "expected, found" in said)
+        return words and (named or not self.of_a_module)
+
+
+def fault_of(text: str) -> Fault:
+    """Return the fault that `str` of it describes.
+
+    Raises:
+        UsageError: another text, or no such kind.
+    """
+    match = _TEXT.match(text)
+    if match is None or match["kind"] not in NATURES:
+        raise UsageError(
+            f"fault {text!r}: expected KIND [of module N] (at S s for S s | from S s on), size X with three "
+            f"decimals, such as {Fault('agent thaw', 4.2, 0.5, 1)}; kinds are {', '.join(KINDS)}"
+        )
+    at_s = float(match["at"] or match["since"])
+    for_s = float(match["lasts"]) if match["lasts"] else math.inf
+    return Fault(match["kind"], at_s, for_s, int(match["module"] or 0), float(match["size"]))

@@ -5,6 +5,7 @@ from pathlib import Path
 from coordinator.recording.run_folder import SESSION, load_recording
 from module_agent.model.errors import RobotError
 from sim.faults.run import Ending
+from sim.faults.schedule import Schedule
 from sim.scoring.score import score
 
 # Of thousands of intervals, all are to hold: five standard deviations, and the resolution of a short motion.
@@ -30,6 +31,23 @@ def check_folder(out: Path, ending: Ending) -> dict[str, str]:
         if wrong:
             violations["wrong robot"] = wrong
     return violations
+
+
+def check_cause(schedule: Schedule, ending: Ending) -> dict[str, str]:
+    """Return a violation where an ending accuses modules, and none of those that something happened to."""
+    if ending.name in ("result", "suspect", "lost", "unbounded") or not all(
+        f.of_a_module for f in schedule.faults
+    ):
+        return {}
+    serials, modules = schedule.robot.serials, len(schedule.robot.modules)
+    sick = {serials[fault.module] for fault in schedule.faults}
+    # The IMUs of two modules are exchanged.
+    sick |= {serials[(f.module + 1) % modules] for f in schedule.faults if f.kind == "IMU swapped"}
+    accused = {serial for serial in serials if serial in ending.text}
+    # How many were found, and which, says which were not.
+    if not accused or accused & sick or "expected, found" in ending.text:
+        return {}
+    return {"wrong cause": f"{ending.text} (it happened to {', '.join(sorted(sick))})"}
 
 
 def _wrong(out: Path) -> str:

@@ -1,14 +1,15 @@
-"""What the motors truly did, tick by tick, against what their modules had accepted.
+"""What the motors truly did, tick by tick, against what was commanded.
 
 The witness sees the plant and the bytes on the wire, and neither the firmware's state nor its opinion.
 """
 
-import math
+from collections.abc import Iterable
+from typing import NamedTuple
 
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
 from module_agent.wire.codec import decode
-from module_agent.wire.keys import Leaf, parse
-from module_agent.wire.messages import Ack
+from module_agent.wire.keys import KeyParts, Leaf, parse
+from module_agent.wire.messages import Ack, LeaseRequest
 from module_agent.wire.refusal import WireError
 from sim.virtual_time.robot import VirtualRobot
 from sim.world.world import TICK_NS
@@ -21,47 +22,104 @@ SLOW_RAD_S = 0.05
 MAX_PWM = 1.0
 
 
-class PlantWitness:
-    """Notes violations by the motors: `violations` maps each kind to the first case of it, as a sentence."""
+class _Held(NamedTuple):
+    """A lease: the boot of its module, the endpoint that it was granted, and until when by the world [ns]."""
 
-    def __init__(self) -> None:
+    boot: int
+    by: str
+    until_ns: int
+
+
+class PlantWitness:
+    """Notes violations by the motors: `violations` maps each kind to the first case of it, as a sentence.
+
+    Args:
+        commanders: the names of endpoints on the network that may command.
+    """
+
+    def __init__(self, commanders: Iterable[str]) -> None:
         self.violations: dict[str, str] = {}
+        self._commanders = frozenset(commanders)
+        self._sent_ns: dict[str, int] = {}
         self._accepted_ns: dict[str, int] = {}
         self._stopped: set[str] = set()
+        self._askers: dict[tuple[str, int], str] = {}
+        self._leases: dict[str, _Held] = {}
 
     def tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
-        """Note which module accepted a command or a stop, and when; a `Tap` of the virtual network."""
-        if kind != "reply":
-            return
-        parts = parse(key)
-        if parts.leaf not in (*COMMANDS, Leaf.STOP):
+        """Note who commands which module, and what that accepts; a `Tap` of the virtual network."""
+        if kind == "sample" and endpoint not in self._commanders:
             return
         try:
-            accepted = decode(Ack, payload).accepted
+            parts = parse(key)
         except WireError:
             return
-        if accepted and parts.leaf is Leaf.STOP:
+        if kind != "reply":
+            if endpoint in self._commanders and parts.leaf in COMMANDS:
+                self._sent_ns[parts.serial] = now_ns
+            if parts.leaf is Leaf.LEASE:
+                self._asked(parts.serial, endpoint, payload)
+        elif endpoint == parts.serial and parts.leaf in (*COMMANDS, Leaf.STOP):
+            try:
+                self._answered(now_ns, parts, decode(Ack, payload))
+            except WireError:
+                return
+
+    def _answered(self, now_ns: int, parts: KeyParts, ack: Ack) -> None:
+        if not ack.accepted:
+            return
+        if parts.leaf is Leaf.STOP:
             self._stopped.add(parts.serial)
-        elif accepted:
-            self._accepted_ns[parts.serial] = now_ns
-            self._stopped.discard(parts.serial)
+            return
+        self._accepted_ns[parts.serial] = now_ns
+        self._stopped.discard(parts.serial)
+        if parts.leaf is not Leaf.LEASE:
+            return
+        if ack.holder is None:
+            self._leases.pop(parts.serial, None)
+            return
+        held, asker = self._leases.get(parts.serial), self._askers.get((parts.serial, ack.re), "?")
+        if held is not None and held.boot == ack.boot and now_ns < held.until_ns and held.by != asker:
+            self._note("two holders", f"module {parts.serial} is held by {held.by} and obeys {asker}")
+        self._leases[parts.serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns)
+
+    def _asked(self, serial: str, endpoint: str, payload: bytes) -> None:
+        try:
+            request = decode(LeaseRequest, payload)
+        except WireError:
+            return
+        # A copy of a request is no request of who copied it.
+        self._askers.setdefault((serial, request.seq), endpoint)
 
     def check(self, robot: VirtualRobot) -> None:
         """Judge what the motors did in the tick that ends."""
-        plant = robot.world.plant
+        t_ns = robot.world.t_ns - TICK_NS
         for k, serial in enumerate(robot.serials):
-            pwm, speed = float(plant.pwm[k]), float(plant.qd_rad_s[k])
-            where = f"module {serial} at {plant.t_ns / 1e9:.3f} s: PWM {pwm:.3f}"
             # What the module asks its bridge for: the plant's bridge clips it.
             asked = float(robot.pwm[k])
-            if not math.isfinite(asked) or abs(asked) > MAX_PWM:
-                self._note("PWM out of range", f"{where} asked {asked:.3f}, expected at most {MAX_PWM:.0f}")
-            late_ns = plant.t_ns - self._accepted_ns.get(serial, -LIFETIME_NS) - LIFETIME_NS
-            if late_ns <= 2 * TICK_NS or pwm == 0.0:
-                continue
-            brakes = abs(pwm) <= DAMPING_LIMIT_PWM and (abs(speed) < SLOW_RAD_S or pwm * speed <= 0.0)
-            if serial not in self._stopped or not brakes:
-                self._note("driven too late", f"{where}, {late_ns / 1e6:.0f} ms after its lifetime ended")
+            if not abs(asked) <= MAX_PWM:
+                text = (
+                    f"module {serial} at {t_ns / 1e9:.3f} s asked {asked:.3f}, expected at most {MAX_PWM:.0f}"
+                )
+                self._note("PWM out of range", text)
+            commanded_ns = min(
+                self._sent_ns.get(serial, -LIFETIME_NS), self._accepted_ns.get(serial, -LIFETIME_NS)
+            )
+            late_ns = t_ns - commanded_ns - LIFETIME_NS
+            if late_ns > 2 * TICK_NS:
+                self._check_off(robot, k, late_ns)
+
+    def _check_off(self, robot: VirtualRobot, k: int, late_ns: int) -> None:
+        """Judge a motor that is commanded no more: off, or braking after a stop."""
+        plant, serial = robot.world.plant, robot.serials[k]
+        # The brake follows the motor's speed, which a spring keeps apart from the output's.
+        pwm, speed = float(plant.pwm[k]), float(plant.motor_rad_s[k])
+        if pwm == 0.0:
+            return
+        brakes = abs(pwm) <= DAMPING_LIMIT_PWM and (abs(speed) < SLOW_RAD_S or pwm * speed <= 0.0)
+        if serial not in self._stopped or not brakes:
+            where = f"module {serial} at {plant.t_ns / 1e9:.3f} s: PWM {pwm:.3f}"
+            self._note("driven too late", f"{where}, {late_ns / 1e6:.0f} ms after its lifetime ended")
 
     def _note(self, kind: str, text: str) -> None:
         self.violations.setdefault(kind, text)

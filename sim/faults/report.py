@@ -6,26 +6,33 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple, get_args
 
-from sim.faults.fault import KINDS, LOSES_MODULE
-from sim.faults.invariants import check_folder
+from module_agent.model.errors import RobotError
+from sim.faults.fault import KINDS
+from sim.faults.invariants import check_cause, check_folder
 from sim.faults.plant_witness import PlantWitness
-from sim.faults.run import run_schedule
-from sim.faults.schedule import draw
-from sim.robot.robot_file import Robot
+from sim.faults.run import COORDINATOR, SUCCESSOR, Ending, run_schedule
+from sim.faults.schedule import Schedule, simpler
 
-Outcome = Literal["right", "named", "stopped", "violation"]
+Outcome = Literal["right", "suspect", "named", "stopped", "violation"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+_WITHOUT_ERROR: dict[str, Outcome] = {"result": "right", "suspect": "suspect", "lost": "stopped"}
+# Sessions that a violation is made simpler in, at the most.
+MAX_SHRINKING = 20
 
 
 class SeedReport(NamedTuple):
     """What became of a seed.
 
-    outcome: the right robot with exit code 0, an error with a name, stopped with its coordinator killed, or a
-    violation of an invariant. named_module: whether the error names a module that was lost, None if none was.
+    modules, network, faults: the session, so that it can be run again. kinds: of its faults.
+    outcome: the right robot with exit code 0, a result called suspect, an error with a name, stopped with its
+    coordinator killed, or a violation of an invariant.
+    named_rightly: whether an error or a suspicion names a fault of the schedule, None without either.
+    simplest: the simplest session found that violates the same invariant, None if none was looked for.
     """
 
     seed: int
     robot: str
+    modules: int
     network: str
     faults: tuple[str, ...]
     kinds: tuple[str, ...]
@@ -33,21 +40,48 @@ class SeedReport(NamedTuple):
     text: str
     outcome: Outcome
     violations: dict[str, str]
-    named_module: bool | None = None
+    named_rightly: bool | None = None
+    simplest: "SeedReport | None" = None
+
+    def options(self, robot: str | None = None) -> str:
+        """Return the options of `x5-sim faults` that repeat it; `robot` is the robot as the user gave it."""
+        faults = "".join(f' --fault "{fault}"' for fault in self.faults)
+        return (
+            f"--seeds {self.seed}..{self.seed} --robot {robot or self.robot} --modules {self.modules} "
+            f"--network {self.network}{faults}"
+        )
 
 
-def run_seed(seed: int, robot: Robot | None = None) -> SeedReport:
-    """Run the session of a seed in a temporary folder and judge it."""
-    schedule, witness = draw(seed, robot), PlantWitness()
+def run_seed(schedule: Schedule, shrinks: bool = True) -> SeedReport:
+    """Run a session in a temporary folder and judge it; one that violates an invariant is made simpler."""
+    report = _judged(schedule)
+    if not (report.violations and shrinks):
+        return report
+    return report._replace(simplest=_simplest(schedule, report))
+
+
+def _judged(schedule: Schedule) -> SeedReport:
+    witness = PlantWitness((COORDINATOR, SUCCESSOR))
+    violations: dict[str, str] = {}
     with TemporaryDirectory(prefix="x5-faults-") as folder:
-        ending = run_schedule(schedule, Path(folder) / "run", witness)
-        violations = witness.violations | check_folder(Path(folder) / "run", ending)
-    outcome: Outcome = "right" if ending.name == "result" else "stopped" if ending.name == "lost" else "named"
-    lost = [schedule.robot.serials[f.module] for f in schedule.faults if f.kind in LOSES_MODULE]
-    named = any(serial in ending.text for serial in lost) if lost and outcome == "named" else None
+        try:
+            ending = run_schedule(schedule, Path(folder) / "run", witness)
+        except RobotError as error:
+            # Not of the coordinator, whose errors are endings.
+            ending = Ending(type(error).__name__, str(error))
+            violations["agent died"] = str(error)
+        except Exception as error:
+            ending = Ending(type(error).__name__, str(error))
+            violations["traceback"] = f"{type(error).__name__}: {error}"
+        violations |= witness.violations | check_folder(Path(folder) / "run", ending)
+        violations |= check_cause(schedule, ending)
+    outcome = _WITHOUT_ERROR.get(ending.name, "named")
+    serials = schedule.robot.serials
+    named = any(fault.is_named(ending.text, serials) for fault in schedule.faults)
     return SeedReport(
-        seed=seed,
-        robot=f"{schedule.robot.name}, {len(schedule.robot.modules)} modules",
+        seed=schedule.seed,
+        robot=schedule.robot.name,
+        modules=len(serials),
         network=schedule.network,
         faults=tuple(map(str, schedule.faults)),
         kinds=tuple(fault.kind for fault in schedule.faults),
@@ -55,8 +89,25 @@ def run_seed(seed: int, robot: Robot | None = None) -> SeedReport:
         text=ending.text,
         outcome="violation" if violations else outcome,
         violations=violations,
-        named_module=named,
+        named_rightly=named if outcome in ("named", "suspect") and not violations else None,
     )
+
+
+def _simplest(schedule: Schedule, report: SeedReport) -> SeedReport:
+    """Return the simplest session found that violates one of the same invariants."""
+    left = MAX_SHRINKING
+    found = True
+    while found and left:
+        found = False
+        for candidate in simpler(schedule):
+            tried = _judged(candidate)
+            left -= 1
+            if tried.violations.keys() & report.violations.keys():
+                schedule, report, found = candidate, tried, True
+                break
+            if not left:
+                break
+    return report
 
 
 def by_fault(reports: Sequence[SeedReport]) -> dict[str, Counter[str]]:

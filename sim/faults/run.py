@@ -1,42 +1,34 @@
 """One session with faults: agents, coordinator and world in virtual time, by the product's own code."""
 
 import asyncio
-import itertools
-from collections.abc import Callable, Iterator
+import json
+import resource
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from coordinator.excitation.plan import Plan
+from coordinator.identification.result import Result
 from coordinator.live_robot.messenger import Sender
-from coordinator.recording.run_folder import SESSION
+from coordinator.recording.run_folder import RESULT, SESSION
+from coordinator.runtime.event_loop import end_tasks
 from coordinator.session.run import Run, RunConfig
-from module_agent.host import AgentHost
 from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network
+from module_agent.wire.keys import parse
 from sim.faults.fault import Fault
+from sim.faults.faulty_robot import BEGINNINGS, FaultyRobot
+from sim.faults.intruder import ATTACKS, OVERHEARD, Intruder
 from sim.faults.plant_witness import PlantWitness
 from sim.faults.schedule import Schedule
 from sim.virtual_time.cable import Cable, CableState
-from sim.virtual_time.loop import VirtualLoop
-from sim.virtual_time.network import VirtualNetwork
-from sim.virtual_time.robot import VirtualRobot, VirtualSettings
-from sim.virtual_time.run import SilentScreen
+from sim.virtual_time.loop import NS_PER_S, VirtualLoop
+from sim.virtual_time.network import Tap, VirtualNetwork
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.run import QUICK_PLAN, SilentScreen
 from sim.world.truth import write_truth
 
 COORDINATOR, SUCCESSOR = "coordinator", "successor"
-# Half the thesis' durations suffice for topology and kinematics.
-PLAN = Plan(
-    dynamics=False,
-    discover_s=0.3,
-    link_s=0.3,
-    settle_s=0.3,
-    rest_s=1.0,
-    travel_speed_rad_s=1.5,
-    sine_centre_s=1.2,
-    sine_sigma_s=0.5,
-)
 # Four joints take 30 s; every motion may be repeated twice, and a run be resumed.
 LIMIT_S = 180.0
 # How long motors are observed after the coordinator has ended: several lifetimes.
@@ -45,10 +37,16 @@ AFTERWARDS_S = 1.0
 DELAY_S = 0.1
 # When a coordinator that was killed is started again, its lease of the modules has lapsed.
 RESTART_S = 2.0
+# How often an intruder strikes.
+STRIKE_S = 0.02
 
 
 class Ending(NamedTuple):
-    """How a session ended: `result`, `lost` (its coordinator was killed), `unbounded`, or an error's name."""
+    """How a session ended: `result`, `suspect`, `lost`, `unbounded`, or by the name of an error.
+
+    suspect: a result that its program does not believe as usual, by exit code 5; the text says why. lost: its
+    coordinator was killed.
+    """
 
     name: str
     text: str = ""
@@ -62,38 +60,27 @@ class _OutOfTime(BaseException):
     """The session has not ended within `LIMIT_S`."""
 
 
-class FaultyRobot(VirtualRobot):
-    """A robot to be broken at will; agents can be restarted any number of times."""
-
-    def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
-        return np.random.SeedSequence(settings.seed), itertools.count(101)
-
-    def end_tasks(self) -> None:
-        """End what a killed coordinator has left behind, as the end of its process would."""
-        remaining = sorted(asyncio.all_tasks(self.loop), key=lambda task: task.get_name())
-
-        async def end() -> None:
-            for task in remaining:
-                task.cancel()
-            await asyncio.gather(*remaining, return_exceptions=True)
-
-        self.loop.run_until_complete(end())
-
-
 def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending:
     """Run the session of a schedule into a folder, truth included, and return how it ended.
 
     Any exception but a `RobotError` is a defect of the product, and passes.
     """
     loop = VirtualLoop()
+    taps: list[Tap] = [witness.tap]
+
+    def tap(now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
+        for each in taps:
+            each(now_ns, endpoint, kind, key, payload)
+
     settings = VirtualSettings(schedule.robot, network(schedule.network), schedule.seed, "x5")
-    robot = FaultyRobot(settings, loop, VirtualNetwork(loop, witness.tap))
-    session = _Session(schedule, robot, out)
+    robot = FaultyRobot(settings, loop, VirtualNetwork(loop, tap), schedule.faults)
+    session = _Session(schedule, robot, out, taps)
     robot.on_tick.append(lambda: witness.check(robot))
     try:
         return session.run()
     finally:
-        robot.end_tasks()
+        limit_file_size(None)
+        end_tasks(loop)
         robot.close()
         loop.close()
 
@@ -101,22 +88,27 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
 class _Session:
     """One session: its coordinator, restarted if the schedule says so, and its faults."""
 
-    def __init__(self, schedule: Schedule, robot: FaultyRobot, out: Path):
+    def __init__(self, schedule: Schedule, robot: FaultyRobot, out: Path, taps: list[Tap]):
         self._schedule = schedule
         self._robot = robot
         self._out = out
+        self._taps = taps
         self._cable = CableState()
         self._disturbances: list[Fault] = []
         self._sender = COORDINATOR
         self._restarts = False
+        self._full = 0
+        self._intruders: dict[Fault, Intruder] = {}
         self._over = False
 
     def run(self) -> Ending:
         robot, loop = self._robot, self._robot.loop
         robot.start()
         for fault in self._schedule.faults:
-            loop.call_at(fault.at_s, self._begin, fault)
-        loop.call_at(LIMIT_S, self._end_of_time)
+            if fault.kind == "intruder":
+                self._await_intruder(fault)
+            loop.schedule_ns(round(fault.at_s * NS_PER_S), partial(self._begin, fault))
+        loop.schedule_ns(round(LIMIT_S * NS_PER_S), self._end_of_time)
         ending = self._coordinate(resume=False)
         if ending.name == "lost" and self._restarts:
             self._sender = SUCCESSOR
@@ -135,30 +127,39 @@ class _Session:
             robot=robot.robot.name,
             out=self._out,
             sender=Sender(self._sender, b"a-secret-of-16-b"),
-            plan=PLAN,
+            plan=QUICK_PLAN,
             expect=len(robot.serials),
             resume=resume,
             inline=True,
             refined_previews=0,
         )
         cable = Cable(robot.endpoint(self._sender), loop, self._cable)
+        task: asyncio.Task[Result] | None = None
         try:
             run = Run(config, cable, lambda: loop.now_ns, loop.call_soon, SilentScreen())
-            loop.run_until_complete(run.run())
+            task = loop.create_task(run.run())
+            loop.run_until_complete(task)
         except RobotError as error:
+            if task is not None and not task.done():
+                raise  # of an agent: it has died of it
             return Ending(type(error).__name__, str(error))
         except _Killed:
             self._bury()
             return Ending("lost")
         except _OutOfTime:
             return Ending("unbounded", f"no end within {LIMIT_S:.0f} s")
-        return Ending("result")
+        return self._judged_by_itself()
+
+    def _judged_by_itself(self) -> Ending:
+        """Return how a program ends that has a result: what it says of it is in its file."""
+        suspicions = json.loads((self._out / RESULT).read_text()).get("suspicions", [])
+        return Ending("suspect", "; ".join(suspicions)) if suspicions else Ending("result")
 
     def _bury(self) -> None:
         """Let the coordinator's remains end without a trace in what it had written, and time pass."""
         session = self._out / SESSION
         crashed = session.read_bytes()
-        self._robot.end_tasks()
+        end_tasks(self._robot.loop)
         session.write_bytes(crashed)
         self._wait(RESTART_S)
 
@@ -173,41 +174,23 @@ class _Session:
     def _begin(self, fault: Fault) -> None:
         if self._over:
             return
-        beginnings: dict[str, Callable[[Fault], object]] = {
-            "agent crash": self._crash,
-            "agent freeze": self._freeze,
-            "agent thaw": self._thaw,
-            "agent reboot": self._reboot,
+        if fault.kind in BEGINNINGS:
+            self._robot.begin(fault)
+            return
+        beginnings: dict[str, Callable[[Fault], None]] = {
             "coordinator crash": self._kill,
             "coordinator restart": self._restart,
+            "coordinator freeze": self._freeze,
+            "intruder": self._intrude,
+            "disk full": self._fill_disk,
         }
-        beginnings.get(fault.kind, self._disturb)(fault)
+        part = fault.nature.part
+        if fault.kind in beginnings or part == "network":
+            beginnings.get(fault.kind, self._disturb)(fault)
 
-    def _later(self, fault: Fault, call: Callable[[], None]) -> None:
-        self._robot.loop.call_later(fault.for_s, call)
-
-    def _crash(self, fault: Fault) -> None:
-        serial = self._robot.serials[fault.module]
-        if serial in self._robot.hosts:
-            self._robot.kill(serial)
-
-    def _freeze(self, fault: Fault) -> AgentHost | None:
-        serial = self._robot.serials[fault.module]
-        host = self._robot.hosts.get(serial)
-        if host is not None:
-            self._robot.freeze(serial)
-        return host
-
-    def _thaw(self, fault: Fault) -> None:
-        serial, host = self._robot.serials[fault.module], self._freeze(fault)
-        if host is not None:
-            self._later(fault, lambda: self._robot.hosts.update({serial: host}))
-
-    def _reboot(self, fault: Fault) -> None:
-        serial = self._robot.serials[fault.module]
-        if serial in self._robot.hosts:
-            self._robot.kill(serial)
-            self._later(fault, lambda: self._robot.boot(serial))
+    def _later(self, for_s: float, call: Callable[[], None]) -> None:
+        loop = self._robot.loop
+        loop.schedule_ns(loop.now_ns + round(for_s * NS_PER_S), call)
 
     def _kill(self, fault: Fault) -> None:
         if self._sender == COORDINATOR:
@@ -218,6 +201,9 @@ class _Session:
         self._restarts = True
         self._kill(fault)
 
+    def _freeze(self, fault: Fault) -> None:
+        self._robot.loop.freeze_tasks(round(fault.for_s * NS_PER_S))
+
     def _disturb(self, fault: Fault) -> None:
         self._disturbances.append(fault)
         self._set_cable()
@@ -226,13 +212,62 @@ class _Session:
             self._disturbances.remove(fault)
             self._set_cable()
 
-        self._later(fault, mend)
+        self._later(fault.for_s, mend)
 
     def _set_cable(self) -> None:
         """Let the cable do what all disturbances that go on together make of it."""
         present, cable = {fault.kind: fault for fault in self._disturbances}, self._cable
         corrupted = present.get("corrupted messages")
         cable.cut = "partition" in present
-        cable.flip = None if corrupted is None else corrupted.byte
+        cable.flip = None if corrupted is None else int(corrupted.size * (1 << 16))
         cable.copies = int("duplicated messages" in present)
         cable.delay_s = DELAY_S if "delayed messages" in present else 0.0
+
+    def _await_intruder(self, fault: Fault) -> None:
+        """Let an intruder hear all that is said; which module it attacks, and how, is in the fault's size."""
+        robot = self._robot
+        attack, part = divmod(fault.size * len(ATTACKS), 1.0)
+        serial = robot.serials[int(part * len(robot.serials))]
+        endpoint = robot.endpoint(f"intruder {fault.at_s}")
+        intruder = Intruder(endpoint, robot.robot.name, serial, int(attack), self._schedule.seed)
+
+        def overhear(now_ns: int, endpoint: str, kind: str, at: str, payload: bytes) -> None:
+            leaf = parse(at).leaf if endpoint == self._sender and kind != "reply" else None
+            if leaf in OVERHEARD and parse(at).serial == serial:
+                intruder.overhear(leaf, payload)
+
+        self._taps.append(overhear)
+        self._intruders[fault] = intruder
+
+    def _intrude(self, fault: Fault) -> None:
+        loop, intruder = self._robot.loop, self._intruders[fault]
+        until_ns = loop.now_ns + round(fault.for_s * NS_PER_S)
+
+        def strike() -> None:
+            if self._over or loop.now_ns >= until_ns:
+                intruder.close()
+            else:
+                intruder.strike()
+                self._later(STRIKE_S, strike)
+
+        strike()
+
+    def _fill_disk(self, fault: Fault) -> None:
+        """Let no file grow beyond what the recording has: writing on fails, as on a full disk."""
+        session = self._out / SESSION
+        size = session.stat().st_size if session.exists() else 0
+        self._full += 1
+        limit_file_size(size)
+
+        def free() -> None:
+            self._full -= 1
+            if not self._full:
+                limit_file_size(None)
+
+        self._later(fault.for_s, free)
+
+
+def limit_file_size(size: int | None) -> None:
+    """Let the files of this process grow to a size in bytes, None for any."""
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size is None else size, hard))

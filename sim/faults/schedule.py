@@ -1,10 +1,18 @@
-"""What a seed stands for: a robot, a network profile and the faults of one session."""
+"""What a seed stands for: a robot, a network profile and the faults of one session.
 
+Every draw has a stream of its own, by the seed and a name. The kind of a fault is that with the largest of
+numbers that belong to the kinds: a kind that is added changes only the seeds that it wins.
+"""
+
+import math
+from collections.abc import Iterator
 from typing import NamedTuple
+from zlib import crc32
 
 import numpy as np
 
-from sim.faults.fault import KINDS, Fault
+from module_agent.model.errors import UsageError
+from sim.faults.fault import KINDS, NATURES, Fault
 from sim.robot.robot_file import Robot, load_robot
 
 # Shipped robots, and how many of their modules: two to four joints, and a tree.
@@ -19,7 +27,7 @@ SMALL_ROBOTS = (
 NETWORKS = ("none", "lan", "wifi")
 # A session of two joints takes 15 s; a fault after its end is none.
 LATEST_S = 14.0
-MAX_FAULTS = 3
+SHORTEST_S, LONGEST_S = 0.02, 1.5
 
 
 class Schedule(NamedTuple):
@@ -33,26 +41,62 @@ class Schedule(NamedTuple):
 
 def draw(seed: int, robot: Robot | None = None) -> Schedule:
     """Draw the session of a seed; the same seed draws the same. `robot` replaces the one drawn."""
-    rng = np.random.default_rng(seed)
+    rng = _stream(seed, "robot")
     # Small robots first: three in four have two joints.
     index = int(rng.integers(3)) if rng.random() < 0.75 else int(rng.integers(3, len(SMALL_ROBOTS)))
-    network = str(rng.choice(NETWORKS))
-    drawn = _small(*SMALL_ROBOTS[index]) if robot is None else robot
-    count = 1 + int(rng.random() < 0.3) + int(rng.random() < 0.1)
-    faults = [_fault(rng, len(drawn.modules)) for _ in range(min(count, MAX_FAULTS))]
+    network = str(_stream(seed, "network").choice(NETWORKS))
+    drawn = (
+        first_modules(load_robot(SMALL_ROBOTS[index][0]), SMALL_ROBOTS[index][1]) if robot is None else robot
+    )
+    count = int(_stream(seed, "count").choice((1, 2, 3), p=(0.6, 0.3, 0.1)))
+    faults = [_fault(seed, number, len(drawn.modules)) for number in range(count)]
     return Schedule(seed, drawn, network, tuple(sorted(faults, key=lambda fault: fault.at_s)))
 
 
-def _small(name: str, modules: int) -> Robot:
-    robot = load_robot(name)
+def first_modules(robot: Robot, modules: int) -> Robot:
+    """Return the robot without all but its first modules.
+
+    Raises:
+        UsageError: fewer than two, or more than it has.
+    """
+    if not 2 <= modules <= len(robot.modules):
+        raise UsageError(f"{modules} modules of {robot.name}: it has {len(robot.modules)}, two are the least")
     return robot.model_copy(update={"modules": robot.modules[:modules]})
 
 
-def _fault(rng: np.random.Generator, modules: int) -> Fault:
+def simpler(schedule: Schedule) -> Iterator[Schedule]:
+    """Yield what is simpler by one step: fewer faults, a smaller robot, a perfect network, shorter faults."""
+    faults = schedule.faults
+    if len(faults) > 1:
+        for k in range(len(faults)):
+            yield schedule._replace(faults=faults[:k] + faults[k + 1 :])
+    modules = len(schedule.robot.modules)
+    if modules > 2:
+        within = tuple(fault._replace(module=min(fault.module, modules - 2)) for fault in faults)
+        yield schedule._replace(robot=first_modules(schedule.robot, modules - 1), faults=within)
+    if schedule.network != NETWORKS[0]:
+        yield schedule._replace(network=NETWORKS[0])
+    for k, fault in enumerate(faults):
+        for_s = LONGEST_S if math.isinf(fault.for_s) else round(0.5 * fault.for_s, 3)
+        if NATURES[fault.kind].ends != "never" and for_s >= SHORTEST_S:
+            yield schedule._replace(faults=(*faults[:k], fault._replace(for_s=for_s), *faults[k + 1 :]))
+
+
+def _stream(seed: int, *names: object) -> np.random.Generator:
+    return np.random.default_rng((seed, *(crc32(str(name).encode()) for name in names)))
+
+
+def _fault(seed: int, number: int, modules: int) -> Fault:
+    kind = max(KINDS, key=lambda each: _stream(seed, number, each, "kind").random())
+    rng, ends = _stream(seed, number, kind), NATURES[kind].ends
     return Fault(
-        kind=KINDS[int(rng.integers(len(KINDS)))],
+        kind=kind,
         at_s=round(float(rng.uniform(0.0, LATEST_S)), 3),
-        for_s=round(float(rng.uniform(0.02, 1.5)), 3),
+        for_s=math.inf if ends == "never" or (ends == "either" and rng.random() < 0.5) else _lasting(rng),
         module=int(rng.integers(modules)),
-        byte=int(rng.integers(1 << 16)),
+        size=min(round(float(rng.random()), 3), 0.999),
     )
+
+
+def _lasting(rng: np.random.Generator) -> float:
+    return round(float(rng.uniform(SHORTEST_S, LONGEST_S)), 3)

@@ -45,7 +45,7 @@ class VirtualSettings(NamedTuple):
     physics: Physics | None = None
 
 
-class _Wires:
+class Wire:
     """The wires inside one module: the world's tick has passed already when the agent asks for it."""
 
     def __init__(self, robot: "VirtualRobot", index: int):
@@ -54,12 +54,15 @@ class _Wires:
 
     @property
     def modules(self) -> Sequence[WiredModule]:
+        """The module, alone."""
         return (self._robot.world.modules[self._index],)
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        """Return the module's sample of the tick that has passed; `pwm` is taken by the robot itself."""
         return (self._robot.world.readings[self._index],)
 
     def close(self) -> None:
+        """Turn the motor off."""
         self._robot.pwm[self._index] = 0.0
 
 
@@ -136,7 +139,7 @@ class VirtualRobot:
     def boot(self, serial: str, **firmware: Any) -> None:
         """Start the agent of a module under a new boot id; `firmware` are settings of this module alone."""
         place = self._index[serial]
-        modules = LoopInside(_Wires(self, place))
+        modules = LoopInside(Wire(self, place))
         config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)._replace(
             **firmware
         )

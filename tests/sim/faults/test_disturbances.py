@@ -13,12 +13,12 @@ from sim.virtual_time.loop import VirtualLoop
 
 def test_a_disturbance_that_ends_leaves_those_that_go_on() -> None:
     loop = VirtualLoop()
-    session = _Session(SimpleNamespace(), SimpleNamespace(loop=loop), Path())  # type: ignore[arg-type]
+    session = _Session(SimpleNamespace(), SimpleNamespace(loop=loop), Path(), [])  # type: ignore[arg-type]
     faults = (
         Fault("delayed messages", 0.1, 1.0),
         Fault("partition", 0.2, 0.3),
         Fault("partition", 0.4, 0.5),
-        Fault("corrupted messages", 0.6, 0.1, byte=7),
+        Fault("corrupted messages", 0.6, 0.1, size=0.5),
     )
     for fault in faults:
         loop.call_at(fault.at_s, session._begin, fault)
@@ -28,7 +28,7 @@ def test_a_disturbance_that_ends_leaves_those_that_go_on() -> None:
         return vars(session._cable)
 
     assert at(0.55) == vars(CableState(cut=True, delay_s=DELAY_S))  # the second partition goes on
-    assert at(0.65) == vars(CableState(cut=True, flip=7, delay_s=DELAY_S))
+    assert at(0.65) == vars(CableState(cut=True, flip=1 << 15, delay_s=DELAY_S))
     assert at(0.95) == vars(CableState(delay_s=DELAY_S))
     assert at(1.2) == vars(CableState())
     loop.close()

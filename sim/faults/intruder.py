@@ -1,0 +1,127 @@
+"""A program on the robot's network that hears everything and sends what no coordinator would.
+
+Packets that ended agents once, commands in the holder's name with all that is published, copies of commands
+that it overheard, a module that does not exist, and garbage. What succeeds by its nature where nothing on the
+network tells who spoke (forged rows, answers in a module's place) is not among them: see the documentation
+of security.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from module_agent.transport.transport import Event, Sample, Transport
+from module_agent.wire.keys import ROOT, Leaf, key
+from module_agent.wire.messages import SCHEMA_VERSION
+
+OVERHEARD = (Leaf.LEASE, Leaf.MOTION, Leaf.SETPOINT, Leaf.GAINS)
+HUGE = 2**62
+# Copies of commands: of the newest so many.
+_REMEMBERED = 16
+
+
+class Intruder:
+    """Attacks one module in one way, a few packets a call; `number` of `ATTACKS` says which."""
+
+    def __init__(self, transport: Transport, robot: str, serial: str, attack: int, seed: int):
+        self._transport = transport
+        self._robot = robot
+        self._serial = serial
+        self._attack = ATTACKS[attack]
+        self._rng = np.random.default_rng(seed)
+        self._status: dict[str, Any] = {}
+        self._overheard: list[tuple[Leaf, bytes]] = []
+        self._sent = 0
+        self._declared = False
+        transport.subscribe(key(robot, serial, Leaf.STATUS), self._hear)
+
+    def overhear(self, leaf: Leaf, payload: bytes) -> None:
+        """Take note of a command to the module."""
+        self._overheard = [*self._overheard[1 - _REMEMBERED :], (leaf, payload)]
+
+    def strike(self) -> None:
+        """Send the packets of one moment."""
+        self._attack(self)
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._transport.close()
+
+    def _hear(self, event: Event) -> None:
+        if isinstance(event, Sample):
+            try:
+                heard = msgpack.unpackb(event.payload)
+            except ValueError:
+                return
+            if isinstance(heard, dict) and heard.get("serial") == self._serial:
+                self._status = heard
+
+    def _publish(self, at: str, message: dict[str, Any]) -> None:
+        self._transport.publish(at, msgpack.packb(message))
+
+    def _ask(self, leaf: Leaf, payload: bytes) -> None:
+        self._sent += 1
+        at = key(self._robot, self._serial, leaf)
+        self._transport.query(at, payload, 0.5, lambda event: None, self._sent)
+
+    def poison(self) -> None:
+        """Publish statuses of a module that cannot be, and of a motion without end."""
+        own = key(self._robot, self._serial, Leaf.STATUS)
+        record = {"motion_id": 1, "pattern": {"kind": "rest", "duration_s": 1.0}, "outcome": "running"}
+        rows = {"start_ns": 0, "start_row": 0, "end_row": HUGE, "origin_rad": 0.0}
+        for wrong in ({"serial": "-bad"}, {"next_row": HUGE}, {"motion": record | rows}, {"t_ns": -HUGE}):
+            self._publish(own, self._status | wrong)
+        self._publish(f"{ROOT}/{self._robot}/-bad/{Leaf.STATUS.value}", self._status | {"serial": "-bad"})
+
+    def impersonate(self) -> None:
+        """Command in the holder's name, as a module publishes it."""
+        status = self._status
+        if not status.get("holder"):
+            return
+        self._sent += 1
+        head = {
+            "v": SCHEMA_VERSION,
+            "serial": self._serial,
+            "boot": status["boot"],
+            "seq": 1_000_000 + self._sent,
+            "sender": status["holder"],
+            "token": status["token"],
+            "echo_ns": status["t_ns"],
+        }
+        lease = {"duration_ns": 1_000_000_000, "secret": b"a-guess-of-16-b!"}
+        for action in ("acquire", "renew", "release"):
+            self._ask(Leaf.LEASE, msgpack.packb(head | lease | {"action": action}))
+        aims = {"position_rad": 3.0, "velocity_rad_s": None, "effort_nm": None}
+        self._publish(key(self._robot, self._serial, Leaf.SETPOINT), head | aims)
+
+    def replay(self) -> None:
+        """Send again what was overheard."""
+        for leaf, payload in list(self._overheard):
+            if leaf is Leaf.SETPOINT:
+                self._transport.publish(key(self._robot, self._serial, leaf), payload)
+            else:
+                self._ask(leaf, payload)
+
+    def haunt(self) -> None:
+        """Be a module that is not there."""
+        if not self._declared:
+            self._declared = True
+            self._transport.declare_alive(key(self._robot, "GHOST", Leaf.ALIVE))
+
+    def litter(self) -> None:
+        """Send random bytes to every key of the module."""
+        for leaf in Leaf:
+            garbage = self._rng.bytes(int(self._rng.integers(1, 200)))
+            self._transport.publish(key(self._robot, self._serial, leaf), garbage)
+            self._ask(leaf, garbage)
+
+
+ATTACKS: tuple[Callable[[Intruder], None], ...] = (
+    Intruder.poison,
+    Intruder.impersonate,
+    Intruder.replay,
+    Intruder.haunt,
+    Intruder.litter,
+)
