@@ -1,5 +1,6 @@
 """`x5-coordinator view`: a finished run in the viewer, on this screen or in a browser."""
 
+import signal
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ import typer
 
 from coordinator.recording.run_folder import VIEW
 from coordinator.runtime.command_line import CommandFailed
+from coordinator.runtime.event_loop import SIGNALS
 from coordinator.viewer import viewer_process
 from coordinator.viewer.targets import SERVE_PORT, WEB_MEMORY, page_url
 from module_agent.model.errors import EXIT_FAILED, UsageError
@@ -37,12 +39,12 @@ def view(
     options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
     served = viewer_process.start([str(recording), *options], port + 1, detached=False)
     typer.echo(f"open {page_url(port)} in a browser; Ctrl-C ends it")
+    ended = threading.Event()
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: ended.set())
     try:
-        pause = threading.Event()
-        while served.process.poll() is None:
-            pause.wait(_POLL_S)
-        raise CommandFailed(f"the viewer ended: {served.output_tail()}", EXIT_FAILED)
-    except KeyboardInterrupt:
-        pass
+        while not ended.wait(_POLL_S):
+            if served.process.poll() is not None:
+                raise CommandFailed(f"the viewer ended: {served.output_tail()}", EXIT_FAILED)
     finally:
         viewer_process.stop(served)

@@ -46,7 +46,8 @@ def test_a_served_recording_is_a_page_that_knows_its_data_until_ctrl_c(tmp_path:
         "--port",
         str(port),
     ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
         assert process.stdout is not None
         said = process.stdout.readline()
         assert f"http://127.0.0.1:{port}?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port + 1}%2Fproxy" in said
@@ -58,5 +59,8 @@ def test_a_served_recording_is_a_page_that_knows_its_data_until_ctrl_c(tmp_path:
         assert f"something listens on port {port} already" in taken.output
         process.send_signal(signal.SIGINT)
         assert process.wait(20.0) == 0
-    assert not viewer_process.listens("127.0.0.1", port)
-    assert not viewer_process.listens("127.0.0.1", port + 1)
+        assert not viewer_process.listens("127.0.0.1", port)
+        assert not viewer_process.listens("127.0.0.1", port + 1)
+    finally:
+        process.kill()
+        process.communicate()
