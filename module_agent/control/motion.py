@@ -96,6 +96,7 @@ class Motion:
         self._position: list[float] = (origin_rad + samples.offset_rad).tolist()
         self._velocity: list[float] = samples.velocity_rad_s.tolist()
         self._effort: list[float] | None = None if effort is None else effort_at(effort, t_s).tolist()
+        self.origin_rad = origin_rad
         self._start_ns = start_ns
         self._end_ns = start_ns + steps * STEP_NS
         self.last_position_rad = self._position[-1]
@@ -164,13 +165,15 @@ def check_setpoint(setpoint: Setpoint, measured_rad: float, limits: Limits) -> N
             f"position {position:.1f} rad is {abs(position - measured_rad):.1f} rad from where the joint is, "
             f"at most {MAX_STEP_RAD:.1f} rad are taken: a motion leads farther",
         )
-    if position is not None and not _within(position, position, limits):
+    if position is not None and not _within(position, limits):
         allowed = f"{limits.min_position_rad} .. {limits.max_position_rad} rad"
         raise WireError(Refusal.LIMIT, f"position {position:.3f} rad is outside {allowed}")
 
 
 def check_motion(motion: Motion, limits: Limits) -> None:
     """Check that a motion stays within the position limits and is not absurdly fast.
+
+    A joint that is beyond a limit may be moved back, and no farther out.
 
     Raises:
         WireError: LIMIT, with the range that the motion needs and the one that is allowed, its speed or its
@@ -179,7 +182,10 @@ def check_motion(motion: Motion, limits: Limits) -> None:
     _check_speed(motion.top_speed_rad_s, limits)
     _check_effort(motion.top_effort_nm, limits)
     low, high = motion.range_rad
-    if not _within(low, high, limits):
+    least, most, origin = limits.min_position_rad, limits.max_position_rad, motion.origin_rad
+    too_low = least is not None and low < min(least, origin)
+    too_high = most is not None and high > max(most, origin)
+    if too_low or too_high:
         allowed = f"{limits.min_position_rad} .. {limits.max_position_rad} rad"
         raise WireError(Refusal.LIMIT, f"the motion needs {low:.3f} .. {high:.3f} rad, allowed are {allowed}")
 
@@ -201,6 +207,6 @@ def _check_size(value: float, times: float, most: float, unit: str) -> None:
         )
 
 
-def _within(low_rad: float, high_rad: float, limits: Limits) -> bool:
+def _within(position_rad: float, limits: Limits) -> bool:
     least, most = limits.min_position_rad, limits.max_position_rad
-    return (least is None or low_rad >= least) and (most is None or high_rad <= most)
+    return (least is None or position_rad >= least) and (most is None or position_rad <= most)

@@ -11,9 +11,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from module_agent.model.errors import UsageError
 from module_agent.wire.messages import Limits
 
-# disabled: this side has no limit; motor_off: the motor is off as soon as the joint could not stop any more;
-# hold: the joint is stopped at the limit and held there against its load; spring: it is stopped there and
-# pushed back like by a damped spring, which gives way to a load.
+# What happens at a limit, before which the joint is slowed down. disabled: it is none; motor_off: the motor
+# is off; hold: the joint is held there against its load; spring: it is pushed back, and gives way to a load.
 LimitAction = Literal["disabled", "motor_off", "hold", "spring"]
 MStopAction = Literal["disabled", "motor_off", "hold"]
 

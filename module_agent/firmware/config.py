@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from module_agent.control.safety import UNCONFIGURED, Safety
 from module_agent.hardware.hardware import ModuleInformation
 from module_agent.model.catalogue import ImuKind, ModuleType, module_type
 from module_agent.model.errors import UsageError
@@ -16,6 +17,7 @@ class FirmwareConfig(NamedTuple):
 
     imu: how well the module's IMU is calibrated, the prior of the module's own estimates.
     name, family: what the module's user calls it, and all modules of its robot.
+    safety: the configured limits, which `limits` has together with those of the type.
     """
 
     serial: str
@@ -33,6 +35,7 @@ class FirmwareConfig(NamedTuple):
     imu: ImuKind = "uncalibrated"
     name: str = ""
     family: str = ""
+    safety: Safety = UNCONFIGURED
 
     @property
     def history_rows(self) -> int:
@@ -47,8 +50,8 @@ def config_of(module: ModuleInformation, boot: int, **settings: Any) -> Firmware
         UnknownModuleType: the catalogue has no such type.
     """
     kind, periods = module_type(module.module_type), (module.tick_ns, module.imu_period_ns)
-    names = {"name": module.name[:MAX_NAME], "family": module.family[:MAX_NAME]}
-    return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **names | settings)
+    own = {"name": module.name[:MAX_NAME], "family": module.family[:MAX_NAME], "safety": module.safety}
+    return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **own | settings)
 
 
 def check_config(config: FirmwareConfig) -> FirmwareConfig:

@@ -19,7 +19,7 @@ from module_agent.firmware.feedback import STATE_INDEX, FeedbackStream
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
 from module_agent.firmware.tick_kernel import BRAKE as BRAKE_MOTOR
 from module_agent.firmware.tick_kernel import FOLLOW, MOTION
-from module_agent.hardware.hardware import Modules, ModuleSample
+from module_agent.hardware.hardware import LimitState, Modules, ModuleSample
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
@@ -42,14 +42,14 @@ from module_agent.wire.messages import (
 )
 from module_agent.wire.refusal import Refusal, WireError
 
+M_STOP = "M-stop pressed"
 FIRMWARE_NAME = "x5-agent 0.1"
 MAX_ROWS_PER_ANSWER = 256
 STATUS_PERIOD_NS = 400_000_000
 # How long after its end a motion is announced to the other modules: a network may lose ten of them in turn.
 ANNOUNCED_NS = 5_000_000_000
-# A fault at the temperature at which a module has no PWM left, and armed again only when it has cooled.
-WINDING_LIMIT_C = 154.0
-WINDING_REARM_C = 140.0
+# A winding that has reached its limit is a fault, and the module is armed again when it has cooled by this.
+WINDING_REARM_K = 14.0
 
 
 class Incoming(NamedTuple):
@@ -92,6 +92,8 @@ class QuietState(NamedTuple):
     state_number: int
     now_ns: int
     targets: tuple[float, ...]
+    limited: int
+    winding_c: float
     row_times: tuple[int, int]
     row_periods: tuple[int, int, int, bool]
 
@@ -126,6 +128,9 @@ class Firmware:
         self._fresh_ns = 0
         self._stopped_ns = 0
         self._announced_until_ns = 0
+        # Whether the motor is off while stopped, and which limits have acted since the last status.
+        self._stopped_off = False
+        self._limited = 0
         self._expiries = 0
         self._seq = 0
         self._now_ns = 0
@@ -140,6 +145,7 @@ class Firmware:
     def step(self, sample: ModuleSample, inbox: Sequence[Incoming]) -> Command:
         """Begin a tick: expire what is stale, read the inbox; return the command for the module."""
         self._sample = sample
+        self._limited |= sample.limits
         sensors = sample.sensors
         now_ns, before_ns = sensors.t_ns, self._now_ns
         self._now_ns = now_ns
@@ -151,14 +157,14 @@ class Firmware:
             self._end_lease()
         for incoming in inbox:
             self._receive(incoming)
-        if sensors.winding_temperature_c >= WINDING_LIMIT_C and self.state != "fault":
+        if sensors.winding_temperature_c >= self.config.safety.winding_c and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", f"winding at {sensors.winding_temperature_c:.0f} C")
         if sample.fault and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", sample.fault)
-        if sample.m_stop and self.state not in ("stopped", "fault"):
-            self._stop("M-stop pressed")
+        if sample.m_stop:
+            self._obey_m_stop()
         return self._commands[self.state]()
 
     def publish(self, pwm: float) -> list[Outgoing]:
@@ -185,7 +191,9 @@ class Firmware:
     def quiet_state(self) -> QuietState:
         """Return what quiet ticks after this one need."""
         state = self.state
-        braking = state == "stopped" or (state == "expired" and self.config.expiry_action == "damping")
+        braking = (state == "stopped" and not self._stopped_off) or (
+            state == "expired" and self.config.expiry_action == "damping"
+        )
         motion = self._motion
         return QuietState(
             source=BRAKE_MOTOR if braking else FOLLOW if motion is None else MOTION,
@@ -200,13 +208,15 @@ class Firmware:
             state_number=STATE_INDEX[state],
             now_ns=self._now_ns,
             targets=self._command[:3],
+            limited=int(self._limited),
+            winding_c=self.config.safety.winding_c,
             row_times=self._rows.times_ns,
             row_periods=self._rows.periods,
         )
 
-    def go_on(self, now_ns: int, targets: Sequence[float], due_ns: int, imu_ns: int) -> None:
-        """Go on from the time, the targets and the rows of a quiet tick."""
-        self._now_ns = now_ns
+    def go_on(self, now_ns: int, targets: Sequence[float], due_ns: int, imu_ns: int, limited: int) -> None:
+        """Go on from the time, the targets, the rows and the limits of a quiet tick."""
+        self._now_ns, self._limited = now_ns, limited
         position_rad, velocity_rad_s, effort_nm = targets
         self._command = Command(position_rad, velocity_rad_s, effort_nm)
         self._rows.go_on(due_ns, imu_ns)
@@ -225,7 +235,7 @@ class Firmware:
             "moving": self._follow_motion,
             "streaming": self._follow_setpoint,
             "expired": on_expiry[self.config.expiry_action],
-            "stopped": lambda: BRAKE,
+            "stopped": lambda: self._rest() if self._stopped_off else BRAKE,
             "fault": self._rest,
         }
 
@@ -271,7 +281,23 @@ class Firmware:
     def _stop(self, note: str) -> None:
         self._finish_motion("stopped")
         self._enter("stop", note)
-        self._stopped_ns = self._now_ns
+        self._stopped_ns, self._stopped_off = self._now_ns, False
+
+    def _obey_m_stop(self) -> None:
+        action = self.config.safety.m_stop
+        if action == "hold":
+            if self.state in ("moving", "streaming"):
+                self._finish_motion("stopped")
+                self._hold()
+                self._enter("hold", M_STOP)
+        elif action != "disabled" and self.state != "fault":
+            if self.state != "stopped":
+                self._stop(M_STOP)
+            self._stopped_off = action == "motor_off"
+
+    def _check_m_stop(self) -> None:
+        if self._sample is not None and self._sample.m_stop and self.config.safety.m_stop != "disabled":
+            raise WireError(Refusal.NOT_ARMED, "the M-stop is pressed: release it first")
 
     def _expire(self) -> None:
         self._expiries += 1
@@ -358,14 +384,12 @@ class Firmware:
             return
         assert self._sample is not None
         winding_c = self._sample.sensors.winding_temperature_c
-        if self.state == "fault" and winding_c > WINDING_REARM_C:
-            raise WireError(
-                Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {WINDING_REARM_C:.0f} C"
-            )
+        cool_c = self.config.safety.winding_c - WINDING_REARM_K
+        if self.state == "fault" and winding_c > cool_c:
+            raise WireError(Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {cool_c:.0f} C")
         if self._sample.fault:
             raise WireError(Refusal.NOT_ARMED, self._sample.fault)
-        if self._sample.m_stop:
-            raise WireError(Refusal.NOT_ARMED, "the M-stop is pressed: release it, then acquire again")
+        self._check_m_stop()
         if self.state == "stopped" and request.echo_ns <= self._stopped_ns:
             raise WireError(Refusal.STALE, "sent before the stop: its sender cannot have known of it")
         if not self.lease.acquire(request, self._now_ns):
@@ -394,6 +418,7 @@ class Firmware:
             return
         if self.state == "moving":
             raise WireError(Refusal.BUSY, f"motion {record.motion_id if record else '?'} is running")
+        self._check_m_stop()
         assert self._sample is not None
         held = self._command.position_rad
         origin = self._sample.sensors.position_rad if math.isnan(held) else held
@@ -416,6 +441,7 @@ class Firmware:
     def _stream(self, setpoint: Setpoint) -> None:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "a motion is running; setpoints are taken when it has ended")
+        self._check_m_stop()
         assert self._sample is not None
         check_setpoint(setpoint, self._sample.sensors.position_rad, self.config.limits)
         if self.state != "streaming":
@@ -447,6 +473,9 @@ class Firmware:
         return acknowledgement(self._head(), self.lease, self._now_ns, re, refused)
 
     def _status(self, re: int) -> Status:
+        limits = tuple(flag.name.lower() for flag in LimitState(self._limited) if flag.name)
+        if re == 0:
+            self._limited = 0
         return Status(
             **self._head(),
             **self.lease.state(self._now_ns),
@@ -458,6 +487,7 @@ class Firmware:
             refusals=dict(self.admission.refusals),
             expiries=self._expiries,
             dropped_events=self.dropped_events,
+            limits=limits,
             note=self._note[:512],
         )
 

@@ -47,7 +47,7 @@ class QuietTicks:
         self._memory = np.zeros((modules, 3, kernel.MEMORY))
         self._motion = np.zeros((modules, 3, _SAMPLES))
         self._floats = np.zeros((modules, 4))
-        self._integers = np.zeros((modules, 5), np.int64)
+        self._integers = np.zeros((modules, 6), np.int64)
         self._last = Readings(modules)
         self._rows = np.zeros(modules, kernel.FLAT_ROW)
         self._row_bytes = self._rows.view(np.uint8).data
@@ -104,12 +104,12 @@ class QuietTicks:
         """Let the objects of a module go on from where its quiet ticks ended."""
         module = self._objects[place]
         assert module is not None
-        due_ns, imu_ns, running, limit, now_ns = self._integers[place].tolist()
+        due_ns, imu_ns, running, limit, now_ns, limited = self._integers[place].tolist()
         if now_ns == self._run_ns[place]:
             # The objects have run the last tick.
             return
         floats = self._floats[place].tolist()
-        module.firmware.go_on(now_ns, floats[:3], due_ns, imu_ns)
+        module.firmware.go_on(now_ns, floats[:3], due_ns, imu_ns, limited)
         pwm, memory = floats[kernel.PWM], self._memory[place].tolist()
         module.loops.go_on(module.number, self._last[place], pwm, bool(running), limit, memory)
 
@@ -141,10 +141,12 @@ class QuietTicks:
             controller.gains.strategy,
             controller.follows_motor,
             *firmware.row_periods,
+            firmware.winding_c,
             *drive.bounds,
         )
         self._floats[place] = (*firmware.targets, drive.pwm)
-        self._integers[place] = (*firmware.row_times, drive.running, drive.limit, firmware.now_ns)
+        own = drive.running, drive.limit, firmware.now_ns, firmware.limited
+        self._integers[place] = (*firmware.row_times, *own)
         self._memory[place] = [loop.memory for loop in controller.loops]
         self._run_ns[place] = firmware.now_ns
 

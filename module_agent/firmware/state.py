@@ -5,8 +5,9 @@
     moving     leased; a motion pattern runs on the module
     streaming  leased; follows setpoints from the network
     expired    no fresh command within the lifetime; the expiry action runs until the lease is acquired again
-    stopped    a stop or the M-stop; the motor is damped until the lease is acquired again
-    fault      the module protects itself (over-temperature); motor off until it has cooled and is acquired
+    stopped    a stop or the M-stop; the motor is damped, or off, until the lease is acquired again
+    fault      the module protects itself (winding, sensors, position); motor off until the cause is gone and
+               the lease is acquired again
 
 A transition that is not in the table does not exist; a command that needs it is refused.
 """
@@ -15,7 +16,9 @@ from typing import Literal
 
 from module_agent.wire.messages import State
 
-Trigger = Literal["acquire", "release", "motion", "motion_done", "setpoint", "expire", "stop", "fault"]
+Trigger = Literal[
+    "acquire", "release", "motion", "motion_done", "setpoint", "hold", "expire", "stop", "fault"
+]
 
 _ALWAYS: dict[Trigger, State] = {"acquire": "armed", "stop": "stopped", "fault": "fault"}
 _LEASED: dict[Trigger, State] = {**_ALWAYS, "release": "idle", "expire": "expired"}
@@ -23,8 +26,8 @@ _LEASED: dict[Trigger, State] = {**_ALWAYS, "release": "idle", "expire": "expire
 TRANSITIONS: dict[State, dict[Trigger, State]] = {
     "idle": _ALWAYS,
     "armed": {**_LEASED, "motion": "moving", "setpoint": "streaming"},
-    "moving": {**_LEASED, "motion_done": "armed"},
-    "streaming": {**_LEASED, "motion": "moving", "setpoint": "streaming"},
+    "moving": {**_LEASED, "motion_done": "armed", "hold": "armed"},
+    "streaming": {**_LEASED, "motion": "moving", "setpoint": "streaming", "hold": "armed"},
     "expired": {**_ALWAYS, "release": "expired"},
     "stopped": {**_ALWAYS, "release": "stopped"},
     "fault": {"acquire": "armed", "release": "fault", "stop": "fault"},

@@ -5,6 +5,7 @@ such a tick, in the same order of operations, so that the results are equal to t
 definition; a module whose tick is not quiet is left untouched here, and they run it.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,15 @@ MODULE = np.dtype(
         *((name, np.int64) for name in ("motion_start_ns", "motion_end_ns", "motion_id", "state")),
         *((name, np.int64) for name in ("strategy", "follows_motor", "row_period_ns", "half_tick_ns")),
         *((name, np.int64) for name in ("imu_period_ns", "waits_for_imu")),
-        *((name, np.float64) for name in ("low_rad", "high_rad", "max_motor_rad_s")),
+        ("winding_c", np.float64),
+        # As `motor_guard.Bounds` has them.
+        *((name, np.int64) for name in ("low", "high")),
+        *((name, np.float64) for name in ("low_rad", "high_rad", "margin_rad")),
+        *((name, np.float64) for name in ("max_motor_rad_s", "ceiling_c")),
+        ("configured", np.int64),
+        *((name, np.float64) for name in ("min_rad_s", "max_rad_s", "min_nm", "max_nm")),
+        *((name, np.float64) for name in ("min_push", "max_push", "braking_rad_s2", "gear_ratio")),
+        *((name, np.float64) for name in ("emf_pwm", "stiff_pwm", "load_pwm")),
     ]
 )
 # Of each loop (position, velocity, effort).
@@ -46,9 +55,9 @@ LOOP = np.dtype(
 HAS_TARGET, TARGET, HAS_LAST, LAST_ERROR, LAST_MEASURED, INTEGRAL, HAS_OUTPUT, OUTPUT = range(8)
 MEMORY = 8
 # Of each module, floats: its targets and its PWM; integers: when a row is due, the last IMU time, whether its
-# loops run, what limits the PWM, and the time of the last tick.
+# loops run, what limits the PWM, the time of the last tick, and what has limited it since the last status.
 POSITION, VELOCITY, EFFORT, PWM = range(4)
-ROW_DUE_NS, LAST_IMU_NS, RUNNING, LIMIT, NOW_NS = range(5)
+ROW_DUE_NS, LAST_IMU_NS, RUNNING, LIMIT, NOW_NS, LIMITED = range(6)
 
 # Columns of a reading, in the order of `SensorSample`.
 T_NS, IMU_NS = 0, 1
@@ -74,11 +83,12 @@ FLAT_ROW: np.dtype[np.void] = np.dtype(
 # As in `control.controller`, `hardware.motor_guard` and `firmware.firmware`; a test compares them.
 # Machine code that is kept does not follow constants of other files.
 NOMINAL_VOLTAGE_V = 48.0
-CEILING_LIMIT_C = 155.0
 DAMPING_LIMIT_PWM = 0.25
-WINDING_LIMIT_C = 154.0
+STOP, OFF, SPRING = 1, 2, 4
+APPROACH_PER_S, RETURN_RAD_S, RELEASE = 5.0, 0.1, 4.0
 STEP_NS = 1_000_000
-LIMIT_NONE, LIMIT_POSITION, LIMIT_TEMPERATURE, LIMIT_OVER_TEMPERATURE = 0, 1, 8, 16
+LIMIT_NONE, LIMIT_POSITION, LIMIT_VELOCITY, LIMIT_EFFORT = 0, 1, 2, 4
+LIMIT_TEMPERATURE, LIMIT_OVER_TEMPERATURE = 8, 16
 
 
 @compiled
@@ -100,7 +110,7 @@ def tick(
 
     times, readings (n, 17) are one block of memory, the times its first two columns; last (n, 17) are those
     of the last tick. modules (n,) `MODULE`, most (n, 15) the largest readings, loops (n, 3) `LOOP`, memory
-    (n, 3, 8), motion (n, 3, samples) targets every millisecond, floats (n, 4), integers (n, 5), rows (n,)
+    (n, 3, 8), motion (n, 3, samples) targets every millisecond, floats (n, 4), integers (n, 6), rows (n,)
     `FLAT_ROW`.
     """
     others = 0
@@ -110,6 +120,7 @@ def tick(
         if not own.ready or not _is_quiet(own, now_ns, integers[i, NOW_NS], readings[i], most[i]):
             others += 1
             continue
+        integers[i, LIMITED] |= integers[i, LIMIT]
         if own.source == MOTION:
             step = (now_ns - own.motion_start_ns) // STEP_NS
             for k in range(3):
@@ -134,7 +145,9 @@ def _is_quiet(own: Any, now_ns: int, before_ns: int, reading: Floats, most: Floa
         return False
     if own.source == MOTION and now_ns >= own.motion_end_ns:
         return False
-    if reading[WINDING] >= WINDING_LIMIT_C and not own.in_fault:
+    if reading[WINDING] >= own.winding_c and not own.in_fault:
+        return False
+    if (own.low == OFF or own.high == OFF) and _has_arrived(own, reading):
         return False
     bad = 0
     for k in range(len(most)):
@@ -279,19 +292,95 @@ def _every_term(g: Any, memory: Floats, target: float, measured: float) -> float
 @compiled
 def _limit(own: Any, pwm: float, integers: Integers, reading: Floats) -> float:
     integers[LIMIT] = LIMIT_NONE
+    if pwm != pwm:
+        return 0.0
     position = reading[Q]
-    if (position > own.high_rad and pwm > 0.0) or (position < own.low_rad and pwm < 0.0):
+    if (own.high == STOP and position > own.high_rad and pwm > 0.0) or (
+        own.low == STOP and position < own.low_rad and pwm < 0.0
+    ):
         integers[LIMIT] = LIMIT_POSITION
         return 0.0
-    room_c = CEILING_LIMIT_C - reading[WINDING]
+    if own.configured:
+        pwm = _within_speed(own, pwm, integers, reading)
+        pwm = _within_push(own, pwm, integers, reading)
+    room_c = own.ceiling_c - reading[WINDING]
     ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
     max_pwm: float = ceiling * reading[VOLTAGE] / NOMINAL_VOLTAGE_V
     if -max_pwm <= pwm <= max_pwm:
         return pwm
-    if pwm != pwm:
-        return 0.0
-    integers[LIMIT] = LIMIT_TEMPERATURE if ceiling != 0.0 else LIMIT_OVER_TEMPERATURE
+    integers[LIMIT] |= LIMIT_TEMPERATURE if ceiling != 0.0 else LIMIT_OVER_TEMPERATURE
     return max_pwm if pwm > 0.0 else -max_pwm
+
+
+@compiled
+def _distances(own: Any, reading: Floats) -> tuple[float, float, float]:
+    output = reading[Q]
+    motor = output - reading[DEFLECTION]
+    low = (output if output < motor else motor) - own.low_rad
+    high = own.high_rad - (output if output > motor else motor)
+    return reading[MOTOR_RATE] / own.gear_ratio, low, high
+
+
+@compiled
+def _has_arrived(own: Any, reading: Floats) -> bool:
+    _, low, high = _distances(own, reading)
+    if own.high == OFF and high <= 2.0 * own.margin_rad:
+        return True
+    return bool(own.low == OFF and low <= 2.0 * own.margin_rad)
+
+
+@compiled
+def _within_speed(own: Any, pwm: float, integers: Integers, reading: Floats) -> float:
+    speed, low, high = _distances(own, reading)
+    load = own.load_pwm * reading[TAU]
+    fastest, slowest = own.max_rad_s, own.min_rad_s
+    if own.high >= OFF:
+        fastest = _allowed(own, high - own.margin_rad, fastest)
+    if own.low >= OFF:
+        slowest = -_allowed(own, low - own.margin_rad, -slowest)
+    held = 0.0 if own.high == SPRING and high < 0.0 else load
+    most = own.emf_pwm * fastest + own.stiff_pwm * (fastest - speed) + held
+    if pwm > most:
+        integers[LIMIT] = LIMIT_VELOCITY if fastest == own.max_rad_s else LIMIT_POSITION
+        pwm = most
+    held = 0.0 if own.low == SPRING and low < 0.0 else load
+    least = own.emf_pwm * slowest + own.stiff_pwm * (slowest - speed) + held
+    if pwm < least:
+        integers[LIMIT] = LIMIT_VELOCITY if slowest == own.min_rad_s else LIMIT_POSITION
+        pwm = least
+    return pwm
+
+
+@compiled
+def _allowed(own: Any, distance: float, most: float) -> float:
+    knee = own.braking_rad_s2 / (APPROACH_PER_S * APPROACH_PER_S)
+    if distance < knee:
+        speed = APPROACH_PER_S * distance
+        if speed < -RETURN_RAD_S:
+            speed = -RETURN_RAD_S
+    else:
+        speed = math.sqrt(2.0 * own.braking_rad_s2 * (distance - 0.5 * knee))
+    return speed if speed < most else most
+
+
+@compiled
+def _within_push(own: Any, pwm: float, integers: Integers, reading: Floats) -> float:
+    emf = own.emf_pwm * (reading[MOTOR_RATE] / own.gear_ratio)
+    effort = reading[TAU]
+    most, least = emf + own.max_push, emf + own.min_push
+    if effort > own.max_nm:
+        most = own.load_pwm * (own.max_nm - RELEASE * (effort - own.max_nm))
+    if effort < own.min_nm:
+        least = own.load_pwm * (own.min_nm - RELEASE * (effort - own.min_nm))
+    most = most if most > 0.0 else 0.0
+    least = least if least < 0.0 else 0.0
+    if pwm > most:
+        integers[LIMIT] |= LIMIT_EFFORT
+        return most
+    if pwm < least:
+        integers[LIMIT] |= LIMIT_EFFORT
+        return least
+    return pwm
 
 
 @compiled

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol, overload
 import numpy as np
 
 from module_agent.control.controller import Command
+from module_agent.control.safety import UNCONFIGURED, Safety
 from module_agent.model.errors import LostError
 from module_agent.wire.messages import GainSet, Limits
 
@@ -113,9 +114,10 @@ class ModuleSample(NamedTuple):
 
 
 class ModuleInformation(NamedTuple):
-    """The description of one module; periods in its own clock, gains as they are in force.
+    """The description of one module; periods in its own clock, gains and limits as they are in force.
 
     serial is unique and never changes; its user gives it a name, and the same family to all of one robot.
+    limits are those of the type, tightened by the configuration `safety`.
     """
 
     serial: str
@@ -126,6 +128,7 @@ class ModuleInformation(NamedTuple):
     limits: Limits
     tick_ns: int
     imu_period_ns: int
+    safety: Safety = UNCONFIGURED
 
 
 class HardwareLost(LostError):

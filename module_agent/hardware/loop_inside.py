@@ -4,11 +4,13 @@ Loops, gains, motor guard, brake and watchdog are here, as they depend on nothin
 says what is in the firmware instead.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from module_agent.control.controller import MOTOR_OFF, Command, Controller
 from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.control.safety import UNCONFIGURED, Safety
 from module_agent.hardware.hardware import (
     LimitState,
     ModuleInformation,
@@ -18,7 +20,7 @@ from module_agent.hardware.hardware import (
     WiredModule,
     Wires,
 )
-from module_agent.hardware.motor_guard import MotorGuard
+from module_agent.hardware.motor_guard import Bounds, MotorGuard
 from module_agent.hardware.sample_check import SampleCheck
 from module_agent.model.catalogue import module_type
 from module_agent.wire.messages import GainSet
@@ -36,19 +38,20 @@ class DriveState(NamedTuple):
     running: bool
     limit: int
     pwm: float
-    bounds: tuple[float, float, float]
+    bounds: Bounds
 
 
 class _Drive:
     """Loops, guard and watchdog of one module."""
 
-    def __init__(self, module: WiredModule):
+    def __init__(self, module: WiredModule, safety: Safety):
         self._kind = module_type(module.module_type)
         self._dt_s = module.tick_ns / 1e9
         self.running = False
         self.module = module
         self.check = SampleCheck(self._kind)
-        self.guard = MotorGuard(self._kind, catalogue_limits(self._kind))
+        self.safety = safety
+        self.guard = MotorGuard(self._kind, catalogue_limits(self._kind), safety)
         self.lifetime_ns = DEFAULT_LIFETIME_NS
         self.identified = False
         self.set_gains(default_gains(self._kind, DEFAULT_STRATEGY))
@@ -56,8 +59,10 @@ class _Drive:
     @property
     def information(self) -> ModuleInformation:
         serial, kind, tick_ns, imu_period_ns = self.module
-        gains, limits = self.controller.gains, catalogue_limits(self._kind)
-        return ModuleInformation(serial, serial, FAMILY, kind, gains, limits, tick_ns, imu_period_ns)
+        gains, limits = self.controller.gains, self.safety.tightened(catalogue_limits(self._kind))
+        return ModuleInformation(
+            serial, serial, FAMILY, kind, gains, limits, tick_ns, imu_period_ns, self.safety
+        )
 
     def set_gains(self, gains: GainSet) -> None:
         self.controller = Controller(self._kind, gains, self._dt_s)
@@ -86,14 +91,16 @@ class LoopInside:
 
     Args:
         wires: to the modules; closed with this.
+        safety: their limits by serial; those that it does not have keep to their type's.
 
     Raises:
         UnknownModuleType: the catalogue does not have the type of a module.
+        UsageError: the limits leave a module no position.
     """
 
-    def __init__(self, wires: Wires):
+    def __init__(self, wires: Wires, safety: Mapping[str, Safety] = MappingProxyType({})):
         self._wires = wires
-        self._drives = [_Drive(module) for module in wires.modules]
+        self._drives = [_Drive(module, safety.get(module.serial, UNCONFIGURED)) for module in wires.modules]
         self.pwm = [0.0] * len(self._drives)
         self._sensors: list[SensorSample | None] = [None] * len(self._drives)
         self._commands = [MOTOR_OFF] * len(self._drives)
@@ -154,8 +161,9 @@ class LoopInside:
         """Check what one module has read; return its sample."""
         drive = self._drives[index]
         sensors = self._sensors[index] = drive.check.checked(read)
-        pwm, limits, fault = self.pwm[index], drive.guard.state, drive.check.fault
-        return ModuleSample(sensors, pwm, self._sequence, limits, False, fault)
+        drive.guard.watch(sensors)
+        fault = drive.check.fault or drive.guard.fault
+        return ModuleSample(sensors, self.pwm[index], self._sequence, drive.guard.state, False, fault)
 
     def run(self, index: int, command: Command) -> float:
         """Run the loops of one module, which has been read, on a command; return its PWM."""

@@ -1,51 +1,167 @@
-"""The output stage of a module: limits of temperature and position, and the brake."""
+"""The output stage of a module: nothing drives the motor but through `MotorGuard.limit`.
+
+Without a configuration it keeps the duty below the winding's ceiling, and never drives out of the type's
+range. A configuration (`control.safety`) adds bounds on the PWM that no gains and no set-point go around.
+Seen at the output, with the motor's speed w and the torque tau read from the spring, the upper ones are
+
+    position, speed   E w1 + S (w1 - w) + L tau     w1: the highest speed at this distance from the limit
+    torque, current   E w + R i                     i: the highest current, L times the torque
+    winding           the ceiling 1 - 1 / (T1 + 1 - T)
+
+and lower ones likewise. E is the back-EMF and R the resistance as PWM at 48 V; L tau is what holds the load,
+S the stiffness of the bound. Near a limit w1 is proportional to the distance d; farther away the motor stops
+within it under the deceleration a: w1^2 = 2 a (d - d0 / 2), with d0 where both have the same slope. d is that
+of output or motor, whichever is nearer, less a margin: a motor that has arrived must not wait for its load to
+follow on the spring.
+"""
 
 import math
+from typing import NamedTuple
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V
+from module_agent.control.safety import MAX_WINDING_C, UNCONFIGURED, LimitAction, Safety
 from module_agent.hardware.hardware import LimitState, SensorSample
 from module_agent.model.catalogue import ModuleType
 from module_agent.wire.messages import Limits
 
 # The manufacturer's PWM ceiling is 1 - 1/(155 - T), which has fallen to zero at 154 C.
-CEILING_LIMIT_C = 155.0
+CEILING_LIMIT_C = MAX_WINDING_C + 1.0
 DAMPING_LIMIT_PWM = 0.25
+# What a side of the range does: nothing; PWM of zero outward, which is the type's own; and those configured.
+FREE, STOP, OFF, HOLD, SPRING = range(5)
+_ACTIONS: dict[LimitAction, int] = {"disabled": FREE, "motor_off": OFF, "hold": HOLD, "spring": SPRING}
+# Speed per distance next to a limit [1/s]: slower than the spring of any type with its load would ring.
+APPROACH_PER_S = 5.0
+# The motor aims at this distance before a limit [rad]: what friction and the spring of a loaded joint leave.
+# Where it is to be off at the limit, it is off from twice that.
+MARGIN_RAD = 0.02
+# The stiffness of the bounds over the back-EMF's own.
+STIFFNESS = 3.0
+# How fast a joint that is outside of its range is led back [rad/s].
+RETURN_RAD_S = 0.1
+# By how much the push is lowered for every Nm over a torque limit [Nm].
+RELEASE = 4.0
+
+
+class Bounds(NamedTuple):
+    """What bounds one module's PWM; infinite where nothing does.
+
+    low, high: action and position of both ends. max_motor_rad_s: the speed at which the motor is unloaded.
+    configured: whether there are more than the type's limits, which are the fields from min_rad_s on.
+    """
+
+    low: int
+    high: int
+    low_rad: float
+    high_rad: float
+    margin_rad: float
+    max_motor_rad_s: float
+    ceiling_c: float
+    configured: bool
+    min_rad_s: float
+    max_rad_s: float
+    min_nm: float
+    max_nm: float
+    min_push: float
+    max_push: float
+    braking_rad_s2: float
+    gear_ratio: float
+    emf_pwm: float
+    stiff_pwm: float
+    load_pwm: float
+
+
+def bounds_of(kind: ModuleType, limits: Limits, safety: Safety) -> Bounds:
+    """Return the bounds of a type with its own `limits` under a configuration.
+
+    Raises:
+        UsageError: no position is within both ranges.
+    """
+    motor = kind.motor
+    tight = safety.tightened(limits)
+    low, high = tight.min_position_rad, tight.max_position_rad
+    chosen = zip(safety.range_rad, safety.at_limit, strict=True)
+    actions = [
+        FREE if end is None else _ACTIONS[action] if math.isfinite(asked) else STOP
+        for end, (asked, action) in zip((low, high), chosen, strict=True)
+    ]
+    ohm_pwm = motor.resistance_ohm / NOMINAL_VOLTAGE_V
+    load_pwm = ohm_pwm / (motor.torque_constant_nm_a * kind.gear_ratio)
+    emf_pwm = kind.gear_ratio * motor.back_emf_v_s_rad / NOMINAL_VOLTAGE_V
+    current = safety.current_a * ohm_pwm
+    low_rad, high_rad = -math.inf if low is None else low, math.inf if high is None else high
+    return Bounds(
+        low=actions[0],
+        high=actions[1],
+        low_rad=low_rad,
+        high_rad=high_rad,
+        margin_rad=min(MARGIN_RAD, 0.125 * (high_rad - low_rad)),
+        max_motor_rad_s=kind.gear_ratio * kind.max_speed_rad_s,
+        ceiling_c=safety.winding_c + 1.0,
+        configured=safety != UNCONFIGURED,
+        min_rad_s=safety.velocity_rad_s[0],
+        max_rad_s=safety.velocity_rad_s[1],
+        min_nm=safety.effort_nm[0],
+        max_nm=safety.effort_nm[1],
+        min_push=max(safety.effort_nm[0] * load_pwm, -current),
+        max_push=min(safety.effort_nm[1] * load_pwm, current),
+        braking_rad_s2=safety.braking_rad_s2,
+        gear_ratio=kind.gear_ratio,
+        emf_pwm=emf_pwm,
+        stiff_pwm=STIFFNESS * emf_pwm,
+        load_pwm=load_pwm,
+    )
 
 
 class MotorGuard:
-    """Bounds on one module's PWM (at 48 V), and the PWM that brakes; `state` is what bounded the last PWM."""
+    """Bounds on one module's PWM (at 48 V), and the PWM that brakes.
 
-    def __init__(self, kind: ModuleType, limits: Limits):
-        self._low_rad = limits.min_position_rad
-        self._high_rad = limits.max_position_rad
-        self._max_motor_rad_s = kind.gear_ratio * kind.max_speed_rad_s
+    `state` is what bounded the last PWM; `fault` why the motor is off, "" while it is not.
+    """
+
+    def __init__(self, kind: ModuleType, limits: Limits, safety: Safety = UNCONFIGURED):
+        self.bounds = bounds_of(kind, limits, safety)
         self.state = LimitState.NONE
+        self.fault = ""
 
-    @property
-    def bounds(self) -> tuple[float, float, float]:
-        """The lowest and highest position, infinite without, and the speed at which the motor is unloaded."""
-        low = -math.inf if self._low_rad is None else self._low_rad
-        high = math.inf if self._high_rad is None else self._high_rad
-        return low, high, self._max_motor_rad_s
+    def watch(self, sample: SensorSample) -> None:
+        """Look whether a joint has arrived at a limit at which its motor is off."""
+        own = self.bounds
+        self.fault = ""
+        if OFF not in (own.low, own.high):
+            return
+        _, low, high = self._distances(sample)
+        reached = "position {:.3f} rad: motor off at the limit {:g} rad"
+        if own.high == OFF and high <= 2.0 * own.margin_rad:
+            self.fault = reached.format(sample.position_rad, own.high_rad)
+        if own.low == OFF and low <= 2.0 * own.margin_rad:
+            self.fault = reached.format(sample.position_rad, own.low_rad)
 
     def limit(self, pwm: float, sample: SensorSample) -> float:
-        """Keep the duty below the winding's ceiling 1 - 1/(155 - T), and never drive out of the range."""
+        """Return the PWM within all bounds; the highest current and the ceiling come last."""
         self.state = LimitState.NONE
-        low, high, position = self._low_rad, self._high_rad, sample.position_rad
-        if (high is not None and position > high and pwm > 0.0) or (
-            low is not None and position < low and pwm < 0.0
+        own = self.bounds
+        if pwm != pwm:
+            # No law makes a NaN of finite numbers; if one did, it would be no command to a motor.
+            return 0.0
+        if self.fault:
+            self.state = LimitState.POSITION
+            return 0.0
+        position = sample.position_rad
+        if (own.high == STOP and position > own.high_rad and pwm > 0.0) or (
+            own.low == STOP and position < own.low_rad and pwm < 0.0
         ):
             self.state = LimitState.POSITION
             return 0.0
-        room_c = CEILING_LIMIT_C - sample.winding_temperature_c
+        if own.configured:
+            pwm = self._within_speed(pwm, sample)
+            pwm = self._within_push(pwm, sample)
+        room_c = own.ceiling_c - sample.winding_temperature_c
         ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
         max_pwm = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V
         if -max_pwm <= pwm <= max_pwm:
             return pwm
-        if pwm != pwm:
-            # No law makes a NaN of finite numbers; if one did, it would be no command to a motor.
-            return 0.0
-        self.state = LimitState.TEMPERATURE if ceiling else LimitState.OVER_TEMPERATURE
+        self.state |= LimitState.TEMPERATURE if ceiling else LimitState.OVER_TEMPERATURE
         return max_pwm if pwm > 0.0 else -max_pwm
 
     def damping(self, sample: SensorSample) -> float:
@@ -54,5 +170,65 @@ class MotorGuard:
         It follows the motor's speed and not the output's, which is behind a spring: feeding that back drives
         an oscillation (25 Hz and 2.6 rad/s on an X5-9 with an arm of 0.5 kg).
         """
-        pwm = -sample.motor_velocity_rad_s / self._max_motor_rad_s
+        pwm = -sample.motor_velocity_rad_s / self.bounds.max_motor_rad_s
         return self.limit(min(max(pwm, -DAMPING_LIMIT_PWM), DAMPING_LIMIT_PWM), sample)
+
+    def _distances(self, sample: SensorSample) -> tuple[float, float, float]:
+        """Return the motor's speed at the output, and the distances to the lower and the upper limit."""
+        own = self.bounds
+        output = sample.position_rad
+        motor = output - sample.deflection_rad
+        low = (output if output < motor else motor) - own.low_rad
+        high = own.high_rad - (output if output > motor else motor)
+        return sample.motor_velocity_rad_s / own.gear_ratio, low, high
+
+    def _within_speed(self, pwm: float, sample: SensorSample) -> float:
+        own = self.bounds
+        speed, low, high = self._distances(sample)
+        load = own.load_pwm * sample.effort_nm
+        fastest, slowest = own.max_rad_s, own.min_rad_s
+        if own.high >= OFF:
+            fastest = _allowed(own, high - own.margin_rad, fastest)
+        if own.low >= OFF:
+            slowest = -_allowed(own, low - own.margin_rad, -slowest)
+        held = 0.0 if own.high == SPRING and high < 0.0 else load
+        most = own.emf_pwm * fastest + own.stiff_pwm * (fastest - speed) + held
+        if pwm > most:
+            self.state = LimitState.VELOCITY if fastest == own.max_rad_s else LimitState.POSITION
+            pwm = most
+        held = 0.0 if own.low == SPRING and low < 0.0 else load
+        least = own.emf_pwm * slowest + own.stiff_pwm * (slowest - speed) + held
+        if pwm < least:
+            self.state = LimitState.VELOCITY if slowest == own.min_rad_s else LimitState.POSITION
+            pwm = least
+        return pwm
+
+    def _within_push(self, pwm: float, sample: SensorSample) -> float:
+        """Return the PWM with no more than the highest torque and current; 0 is always possible."""
+        own = self.bounds
+        emf = own.emf_pwm * (sample.motor_velocity_rad_s / own.gear_ratio)
+        effort = sample.effort_nm
+        most, least = emf + own.max_push, emf + own.min_push
+        if effort > own.max_nm:
+            most = own.load_pwm * (own.max_nm - RELEASE * (effort - own.max_nm))
+        if effort < own.min_nm:
+            least = own.load_pwm * (own.min_nm - RELEASE * (effort - own.min_nm))
+        most = most if most > 0.0 else 0.0
+        least = least if least < 0.0 else 0.0
+        if pwm > most:
+            self.state |= LimitState.EFFORT
+            return most
+        if pwm < least:
+            self.state |= LimitState.EFFORT
+            return least
+        return pwm
+
+
+def _allowed(own: Bounds, distance: float, most: float) -> float:
+    """Return the highest speed towards a limit at a distance from it, at most `most`."""
+    knee = own.braking_rad_s2 / (APPROACH_PER_S * APPROACH_PER_S)
+    if distance < knee:
+        speed = max(APPROACH_PER_S * distance, -RETURN_RAD_S)
+    else:
+        speed = math.sqrt(2.0 * own.braking_rad_s2 * (distance - 0.5 * knee))
+    return min(speed, most)

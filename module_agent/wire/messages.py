@@ -256,7 +256,8 @@ class Status(Message):
     While an exploration motion runs, and for some seconds after it, the same is published on `motion`, for
     the other modules.
 
-    `re` is the sequence number of the question that this answers, 0 when published.
+    `re` is the sequence number of the question that this answers, 0 when published. `limits` are the limits
+    that have bounded the motor's PWM since the last published one, such as "position" (see `LimitState`).
     """
 
     re: Counter = 0
@@ -270,6 +271,7 @@ class Status(Message):
     refusals: dict[Name, Counter]
     expiries: Counter
     dropped_events: Counter
+    limits: Annotated[tuple[Name, ...], Field(max_length=8)] = ()
     note: Text = ""
 
 

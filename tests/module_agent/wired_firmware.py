@@ -32,7 +32,7 @@ class WiredFirmware:
 
     def __init__(self, config: FirmwareConfig):
         self._wires = ScriptedWires(config.kind.name, config.serial)
-        self.modules = LoopInside(self._wires)
+        self.modules = LoopInside(self._wires, {config.serial: config.safety})
         self.firmware = Firmware(config, self.modules)
 
     def tick(

@@ -1,5 +1,6 @@
 """Quiet ticks in machine code and ticks of the Python objects are the same ticks, to the bit."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 
 from module_agent.control import controller
 from module_agent.control.gains import default_gains
-from module_agent.firmware import firmware, tick_kernel
+from module_agent.control.safety import UNCONFIGURED, Safety
+from module_agent.firmware import tick_kernel
 from module_agent.firmware.config import config_of
 from module_agent.hardware import motor_guard
 from module_agent.hardware.hardware import LimitState, ModuleSample, SensorSample, WiredModule
@@ -106,9 +108,16 @@ class Network:
 class Agent:
     """One agent process of three modules, whose quiet ticks are compiled or not."""
 
-    def __init__(self, is_compiled: bool, strategy: int, expiry: str, rate_hz: float):
+    def __init__(
+        self,
+        is_compiled: bool,
+        strategy: int,
+        expiry: str,
+        rate_hz: float,
+        safety: Sequence[Safety] = (UNCONFIGURED,) * 3,
+    ):
         self.wires, self.network = Scripted(), Network()
-        loops = LoopInside(self.wires)
+        loops = LoopInside(self.wires, dict(zip(SERIALS, safety, strict=True)))
         modules: Any = loops if is_compiled else Plain(loops)
         configs = [
             config_of(
@@ -189,6 +198,23 @@ ACTIONS = st.one_of(
     st.tuples(st.just("hot"), st.integers(0, 2), st.floats(100.0, 160.0)),
     st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([0.0, 12.0, 24.0, 48.0])),
     st.tuples(st.just("clock"), st.integers(0, 2), st.sampled_from([-700, -1, 3, 300])),
+)
+
+SIDES = st.sampled_from(["disabled", "motor_off", "hold", "spring"])
+# The joint walks some 0.01 to 0.1 rad: limits about where it is, and those that are too narrow for it.
+LIMITS = st.one_of(
+    st.just(UNCONFIGURED),
+    st.builds(
+        Safety,
+        position_rad=st.tuples(
+            st.sampled_from([-math.inf, -0.5, -0.02]), st.sampled_from([math.inf, 0.4, 0.01])
+        ),
+        at_limit=st.tuples(SIDES, SIDES),
+        velocity_rad_s=st.sampled_from([math.inf, 0.5, 0.05]),
+        effort_nm=st.sampled_from([math.inf, 2.0, 0.2]),
+        current_a=st.sampled_from([math.inf, 0.1]),
+        winding_c=st.sampled_from([154.0, 90.0]),
+    ),
 )
 
 
@@ -291,11 +317,17 @@ class Life:
     st.sampled_from(["motor_off", "hold", "damping"]),
     st.sampled_from([250.0, 400.0, 1000.0]),
     st.integers(0, 2**20),
+    st.tuples(LIMITS, LIMITS, LIMITS),
 )
 def test_compiled_quiet_ticks_and_python_ticks_are_equal_to_the_bit(
-    actions: list[tuple[Any, ...]], strategy: int, expiry: str, rate_hz: float, seed: int
+    actions: list[tuple[Any, ...]],
+    strategy: int,
+    expiry: str,
+    rate_hz: float,
+    seed: int,
+    safety: tuple[Safety, Safety, Safety],
 ) -> None:
-    agents = [Agent(is_compiled, strategy, expiry, rate_hz) for is_compiled in (True, False)]
+    agents = [Agent(is_compiled, strategy, expiry, rate_hz, safety) for is_compiled in (True, False)]
     life = Life(agents, seed)
     life.ticks(3)
     for k in range(3):
@@ -329,15 +361,14 @@ def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_kernels_constants_are_those_of_the_objects() -> None:
     assert tick_kernel.NOMINAL_VOLTAGE_V == controller.NOMINAL_VOLTAGE_V
-    assert tick_kernel.CEILING_LIMIT_C == motor_guard.CEILING_LIMIT_C
-    assert tick_kernel.DAMPING_LIMIT_PWM == motor_guard.DAMPING_LIMIT_PWM
-    assert tick_kernel.WINDING_LIMIT_C == firmware.WINDING_LIMIT_C
-    named = (LimitState.NONE, LimitState.POSITION, LimitState.TEMPERATURE, LimitState.OVER_TEMPERATURE)
-    kernels = (
-        tick_kernel.LIMIT_NONE,
-        tick_kernel.LIMIT_POSITION,
-        tick_kernel.LIMIT_TEMPERATURE,
-        tick_kernel.LIMIT_OVER_TEMPERATURE,
-    )
-    assert kernels == tuple(map(int, named))
+    for name in (
+        *("DAMPING_LIMIT_PWM", "STOP", "OFF", "SPRING"),
+        *("APPROACH_PER_S", "RETURN_RAD_S", "RELEASE"),
+    ):
+        assert getattr(tick_kernel, name) == getattr(motor_guard, name), name
+    for flag in (LimitState.NONE, *LimitState):
+        assert getattr(tick_kernel, f"LIMIT_{flag.name}") == flag.value
+    # The record of a module ends with the fields of its bounds, which are stored in this order.
+    bounds = motor_guard.Bounds._fields
+    assert tick_kernel.MODULE.names[-len(bounds) :] == bounds
     assert len(SensorSample._fields) == tick_kernel.COLUMNS

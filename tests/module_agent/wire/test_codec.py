@@ -150,6 +150,7 @@ EXAMPLES: list[Message] = [
         refusals={"stale": 2},
         expiries=1,
         dropped_events=0,
+        limits=("position",),
     ),
     Estimate(
         **HEAD,
