@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from module_agent.control.safety_file import read_safety
 from module_agent.firmware.config import config_of
 from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.hardware import HardwareLost
@@ -110,6 +111,10 @@ def main(
             metavar="DIR", help="Speak mutual TLS with the keys in this folder (x5-coordinator keys)."
         ),
     ] = None,
+    safety: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Limits that the modules enforce, as TOML or HEBI safety XML."),
+    ] = None,
     imu: Annotated[ImuKind, typer.Option(help="Calibration of the modules' IMUs.")] = "uncalibrated",
 ) -> None:
     """Run the agent of one or several modules until the world ends or a signal comes."""
@@ -126,6 +131,7 @@ def main(
             injected = network_named(network)
             if expiry not in ("motor_off", "hold", "damping"):
                 raise UsageError(f"--expiry {expiry}: it must be motor_off, hold or damping")
+            limits = read_safety(safety, serial) if safety else {}
             known = host_credentials(secure, robot, serial) if secure else None
             transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed, known)
             opened.callback(transport.close)
@@ -134,7 +140,7 @@ def main(
             gc.collect()
             gc.freeze()
             # The world waits for every agent on its bus, so the bus comes last.
-            modules = LoopInside(BusClient(bus, serial))
+            modules = LoopInside(BusClient(bus, serial), limits)
             opened.callback(modules.close)
             configs = [
                 config_of(

@@ -31,7 +31,7 @@ from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.name: path.read_text() for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
-PAGES_WITH_COMMANDS = ["guide.md", "benchmarks.md", "security.md", "scale.md", "export.md"]
+PAGES_WITH_COMMANDS = ["guide.md", "benchmarks.md", "security.md", "safety.md", "scale.md", "export.md"]
 SCRIPTS = Path(sys.executable).parent
 # What a first-time user waits for at most; each of these takes well under a minute on two cores.
 PATIENCE_S = 240
@@ -89,6 +89,7 @@ def test_all_commands_of_a_page_succeed_one_after_the_other(
 ) -> None:
     (tmp_path / "runs").mkdir()
     (tmp_path / "shorter.toml").write_text(SHORTER_PLAN)
+    (tmp_path / "limits.toml").write_text(blocks("toml", "safety.md")[0])
     for line in (line for block in blocks("sh", page) for line in commands(block)):
         words = shlex.split(line)
         if words[-1] == "&":
@@ -203,7 +204,7 @@ def test_the_readme_fits_on_a_first_screen_and_a_bit() -> None:
 
 def test_the_robot_file_of_the_guide_is_a_robot(tmp_path: Path) -> None:
     path = tmp_path / "my_arm.toml"
-    path.write_text("\n".join(blocks("toml")))
+    path.write_text("\n".join(blocks("toml", "guide.md")))
     robot = load_robot(path)
     assert [module.serial for module in robot.modules] == ["shoulder", "elbow"]
     assert [obstacle.name for obstacle in robot.obstacles] == ["table"]

@@ -18,7 +18,7 @@ from module_agent.transport.transport import Transport
 
 @with_options
 def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = False) -> None:
-    """List the modules on the network: state, holder of the lease, delay of feedback, refused messages.
+    """List the modules on the network: state, holder, acting limits, delay of feedback, refused messages.
 
     Exit codes: 0 all answer, 1 a module does not answer or too few do, 2 wrong usage.
     """
@@ -41,7 +41,9 @@ def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = Fa
 
 def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> Table:
     """Return the modules with the delay of their feedback from sample to here."""
-    table = new_table(robot, "serial | state | holder | >delay p50 [ms] | >p99 [ms] | expiries | refused")
+    table = new_table(
+        robot, "serial | state | holder | >delay p50 [ms] | >p99 [ms] | expiries | limited by | refused"
+    )
     for status in found.statuses:
         delay = delays.get(status.serial)
         table.add_row(
@@ -51,6 +53,7 @@ def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> T
             figure(delay and delay.p50_ms, ".1f"),
             figure(delay and delay.p99_ms, ".1f"),
             str(status.expiries),
+            ", ".join(status.limits) or "-",
             ", ".join(f"{k} {v}" for k, v in status.refusals.items()) or "-",
         )
     return table

@@ -9,6 +9,10 @@ import typer
 from coordinator.commands.options import WithReport
 from coordinator.recording.run_folder import RunFolderError, check_free
 from coordinator.runtime.event_loop import check_speed
+from module_agent.control.gains import catalogue_limits
+from module_agent.control.safety import Safety
+from module_agent.control.safety_file import read_safety
+from module_agent.model.catalogue import module_type
 from module_agent.model.errors import UsageError
 from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.profile_file import network as network_named
@@ -95,7 +99,27 @@ class LaunchOptions:
         Path | None,
         typer.Option(metavar="DIR", help="Speak mutual TLS, keys in this folder; makes what is missing."),
     ] = None
+    safety: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Limits that the modules enforce, as TOML or HEBI safety XML."),
+    ] = None
     report: WithReport = True
+
+    def limits_of(self, robot: Robot) -> dict[str, Safety]:
+        """Return the limits of the robot's modules by serial, none without a file.
+
+        Raises:
+            UsageError: the file is wrong, or leaves a module no position.
+        """
+        if self.safety is None:
+            return {}
+        limits = read_safety(self.safety, robot.serials, whole_robot=True)
+        for module in robot.modules:
+            try:
+                limits[module.serial].tightened(catalogue_limits(module_type(module.type)))
+            except UsageError as error:
+                raise UsageError(f"{self.safety}: {module.serial}: {error}") from error
+        return limits
 
     def check(self) -> None:
         """Check what is wrong before anything is started.

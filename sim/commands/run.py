@@ -57,6 +57,7 @@ def run(
         refined_previews=MAX_REFINED_MODULES,
         out=launched.new_folder(robot),
         report=launched.report,
+        safety=launched.limits_of(robot),
     )
     _run_virtual(config, quiet)
     score_run(config.out)
@@ -91,6 +92,7 @@ def _launch(
     settings.choice().of(robot)
     plan = motions.chosen()
     settings.pushes_on(robot)
+    limits = launched.limits_of(robot)
     reported = () if launched.report else ("--no-report",)
     config = LaunchConfig(
         robot_file=settings.robot,
@@ -110,6 +112,7 @@ def _launch(
         coordinator_options=("--no-advise", *reported, *coordinator_options, *motions.arguments()),
         out=launched.new_folder(robot),
         secure=launched.secure,
+        safety=limits,
     )
     if config.secure is not None:
         make_credentials(config.secure, robot.name, robot.serials, [s for s in config.shares if len(s) > 1])

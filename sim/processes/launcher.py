@@ -7,10 +7,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
+from module_agent.control.safety import Safety
+from module_agent.control.safety_file import safety_toml
 from module_agent.main import ATTACHED
 from module_agent.model.errors import RobotError
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
@@ -21,6 +24,7 @@ START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 5.0
 WATCH_S = 0.1
 LOGS = "logs"
+SAFETY = "safety.toml"
 # The file systems' limit is 255 bytes.
 _MAX_NAME = 100
 # A process is woken once a tick whatever it hosts: eight modules in one cost a sixth of eight processes.
@@ -44,6 +48,8 @@ class LaunchConfig(NamedTuple):
     `pushes` are on the world, as its option `--push` takes them.
     `within` maps the name of a process ("world", "coordinator", or "agent" and its serials) to the command
     that it is run by, such as `nsenter` with a network namespace. `secure` is a folder of keys.
+    `safety` are the limits of the modules by serial, which the agents read from `safety.toml` in the run's
+    folder.
     """
 
     robot_file: str
@@ -63,6 +69,7 @@ class LaunchConfig(NamedTuple):
     imu_rate_hz: float = 250.0
     physics: Physics = "pybullet"
     secure: Path | None = None
+    safety: Mapping[str, Safety] = MappingProxyType({})
 
     @property
     def shares(self) -> list[tuple[str, ...]]:
@@ -130,6 +137,8 @@ class Launcher:
 
     def start_agents(self) -> list[Child]:
         """Start the agent processes; they wait for the coordinator by themselves."""
+        if self.config.safety:
+            (self.config.out / SAFETY).write_text(safety_toml(self.config.safety), encoding="utf-8")
         return [self.start_agent(share, index) for index, share in enumerate(self.config.shares)]
 
     def start_agent(self, serials: Sequence[str], index: int = 0) -> Child:
@@ -138,6 +147,8 @@ class Launcher:
         arguments = ["module_agent.main", "--bus", self.bus, "--robot", config.robot_name]
         arguments += ["--connect", config.endpoint, "--network", config.network]
         arguments += ["--seed", str(1000 * config.seed + index + 1), *config.secured, *config.agent_options]
+        if config.safety:
+            arguments += ["--safety", str(config.out / SAFETY)]
         for serial in serials:
             arguments += ["--serial", serial]
         agent = self._start(f"agent {','.join(serials)}", arguments, up=ATTACHED)

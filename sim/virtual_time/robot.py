@@ -1,13 +1,15 @@
 """One robot in virtual time: world, network, and one agent for every module, on one event loop."""
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from coordinator.runtime.event_loop import Interruption, run_to_end
+from module_agent.control.safety import Safety
 from module_agent.firmware.config import config_of
 from module_agent.firmware.quiet_ticks import QUIET, QuietTicks
 from module_agent.hardware.hardware import SensorSample, WiredModule
@@ -32,7 +34,8 @@ class VirtualSettings(NamedTuple):
     """The settings of a virtual robot; every seed in it follows from `seed`.
 
     `noise_seed` makes it another day of the same robot: other noise and network, the same modules.
-    `pushes` act on the world from outside; `physics` is the engine that moves its bodies.
+    `pushes` act on the world from outside; `physics` is the engine that moves its bodies. `safety` are the
+    limits of modules by serial; the others have their type's.
     """
 
     robot: Robot
@@ -43,6 +46,7 @@ class VirtualSettings(NamedTuple):
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
     physics: Physics | None = None
+    safety: Mapping[str, Safety] = MappingProxyType({})
 
 
 class Wire:
@@ -111,6 +115,7 @@ class VirtualRobot:
         self._quiet = QuietTicks(len(self.serials))
         self.on_tick: list[Callable[[], None]] = []
         self._profile = settings.profile
+        self._safety = settings.safety
         self._endpoint_seeds, self._boot_ids = self._draws(settings)
         self._firmware = firmware
         self.hosts: dict[str, AgentHost] = {}
@@ -139,7 +144,7 @@ class VirtualRobot:
     def boot(self, serial: str, **firmware: Any) -> None:
         """Start the agent of a module under a new boot id; `firmware` are settings of this module alone."""
         place = self._index[serial]
-        modules = LoopInside(Wire(self, place))
+        modules = LoopInside(Wire(self, place), self._safety)
         config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)._replace(
             **firmware
         )

@@ -1,7 +1,8 @@
 """A whole run in virtual time: the same agents, coordinator and world in one process."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from coordinator.excitation.plan import Plan
@@ -10,6 +11,7 @@ from coordinator.live_robot.messenger import Sender
 from coordinator.runtime.event_loop import Interruption
 from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
+from module_agent.control.safety import Safety
 from module_agent.network_emulation.profile_file import network
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.physics.engine import Physics
@@ -39,7 +41,7 @@ class VirtualConfig(NamedTuple):
     """Settings of a virtual run; all randomness follows from `seed`, and from `noise_seed` if given.
 
     `baseline`, `measured`, `report` and `refined_previews` as in `RunConfig`; by default there is no preview.
-    `pushes` act on the robot from outside.
+    `pushes` act on the robot from outside. `safety` are the limits of modules by serial.
     """
 
     robot: Robot
@@ -56,6 +58,7 @@ class VirtualConfig(NamedTuple):
     physics: Physics | None = None
     measured: tuple[Path, ...] = ()
     report: bool = False
+    safety: Mapping[str, Safety] = MappingProxyType({})
 
 
 class SilentScreen:
@@ -88,6 +91,7 @@ def run_virtual(
         pushes=config.pushes,
         imu_rate_hz=config.imu_rate_hz,
         physics=config.physics,
+        safety=config.safety,
     )
     with virtual_robot(settings, imu=config.plan.imu) as robot:
         run = Run(

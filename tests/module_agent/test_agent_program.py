@@ -35,6 +35,7 @@ from module_agent.worker import ThreadWorker
         (("--connect", "tcp/127.0.0.1"), "an address of tcp is HOST:PORT"),
         (("--connect", "carrier/pigeon:1"), "unknown protocol 'carrier'"),
         (("--listen", "tcp/127.0.0.1:99999"), "with a port of 1 to 65535"),
+        (("--safety", "none.toml"), "none.toml: cannot be read"),
     ],
 )
 def test_wrong_usage_is_answered_at_once_with_what_is_right(arguments: tuple[str, ...], message: str) -> None:

@@ -73,6 +73,27 @@ link = { pose = { xyz_m = [0.0, 0.0, 0.5] } }
 """
 
 
+@pytest.mark.parametrize("command", [("run", "--virtual"), ("launch",)])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[default]\nposition_rad = [1.0, -1.0]\n", "limits.toml:2: default.position_rad: 1 .. -1"),
+        ("[default]\n[module.X-9]\n", "limits.toml:2: module.X-9: the robot has no such module"),
+        ("<group_safety><mstop><strategy>off</strategy></mstop></group_safety>", "1 values for 16 modules"),
+        ("[default]\nposition_rad = [2.0, 3.0]\n", "the type's own range is -1.5708 .. 1.5708"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused_before_anything_is_started(
+    tmp_path: Path, command: tuple[str, ...], text: str, words: str
+) -> None:
+    (tmp_path / "limits.toml").write_text(text)
+    limits, out = str(tmp_path / "limits.toml"), str(tmp_path / "run")
+    done = CliRunner().invoke(app, [*command, "snake16", "--safety", limits, "--out", out])
+    assert done.exit_code == 2, done.output
+    assert words in " ".join(done.output.split())
+    assert not Path(out).exists()
+
+
 @pytest.mark.parametrize("command", [("world", "--bus", "bus"), ("run", "--virtual", "--out", "run")])
 def test_a_robot_too_soft_to_stand_is_wrong_usage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]

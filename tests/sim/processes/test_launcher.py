@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sim.processes.launcher import LaunchConfig, default_processes
+from module_agent.control.safety import Safety
+from module_agent.control.safety_file import read_safety
+from sim.processes.launcher import SAFETY, LaunchConfig, Launcher, default_processes
 
 
 @pytest.mark.parametrize(
@@ -23,3 +25,25 @@ def test_every_module_is_in_one_process(processes: int | None) -> None:
     shares = LaunchConfig("file", "robot", serials, Path(), processes=processes).shares
     assert sorted("".join("".join(share) for share in shares)) == list(serials)
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+def test_agents_read_the_limits_of_their_modules_from_the_folder_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = {serial: Safety(position_rad=(-1.0, k)) for k, serial in enumerate("ABC", start=1)}
+    config = LaunchConfig("file", "robot", ("A", "B", "C"), tmp_path, processes=2, safety=limits)
+    launcher = Launcher(config, lambda line: None)
+    started: list[list[str]] = []
+
+    def start(name: str, arguments: list[str], up: str) -> None:
+        started.append(arguments)
+
+    monkeypatch.setattr(launcher, "_start", start)
+    launcher.start_agents()
+    read = {}
+    for arguments in started:
+        path = Path(arguments[arguments.index("--safety") + 1])
+        assert path == tmp_path / SAFETY
+        serials = [arguments[k + 1] for k, word in enumerate(arguments) if word == "--serial"]
+        read |= read_safety(path, serials)
+    assert read == limits
