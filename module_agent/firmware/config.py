@@ -50,7 +50,11 @@ def config_of(module: ModuleInformation, boot: int, **settings: Any) -> Firmware
         UnknownModuleType: the catalogue has no such type.
     """
     kind, periods = module_type(module.module_type), (module.tick_ns, module.imu_period_ns)
-    own = {"name": module.name[:MAX_NAME], "family": module.family[:MAX_NAME], "safety": module.safety}
+    own: dict[str, Any] = {
+        "name": module.name[:MAX_NAME],
+        "family": module.family[:MAX_NAME],
+        "safety": module.safety,
+    }
     return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **own | settings)
 
 
