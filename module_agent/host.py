@@ -18,9 +18,9 @@ from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
 from module_agent.torque_information.service import InformationService, Worker
+from module_agent.transport.inbox import Inbox
 from module_agent.transport.transport import (
     Event,
-    Inbox,
     Reply,
     Request,
     Sample,
@@ -28,7 +28,7 @@ from module_agent.transport.transport import (
     Transport,
     Undeclare,
 )
-from module_agent.wire.codec import decode, encode
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import (
@@ -71,9 +71,9 @@ class HostedModule:
         self.serial = config.serial
         self.firmware = Firmware(config, modules, index)
         self.observer = Observer(config.serial, config.boot, IMU_PRIORS[config.imu])
-        self.inbox = Inbox()
-        # Apart from all else, so that no flood can keep a stop out.
-        self.stops = Inbox(capacity=16)
+        self.inbox = Inbox(MAX_MESSAGE_BYTES)
+        # Apart from all else, and read to its end in every tick, so that no flood can keep a stop out.
+        self.stops = Inbox(TOPICS[Leaf.STOP].max_bytes_to_module)
         self.now_ns = 0
         self.requests: dict[int, Request] = {}
         self._request_id = 0
@@ -94,8 +94,8 @@ class HostedModule:
     def collect(self) -> bool:
         """Take what has arrived by now, if anything; its age is judged by the time of the next sample."""
         if self.stops.waiting or self.inbox.waiting:
-            self._arrived = self.stops.drain() + self.inbox.drain()
-            self.firmware.dropped_events = self.inbox.dropped
+            self._arrived = self.stops.drain(limit=len(self.stops)) + self.inbox.drain()
+            self.firmware.dropped_events = self.inbox.dropped + self.stops.dropped
         return bool(self._arrived)
 
     def step(self, sample: ModuleSample) -> Command:
@@ -193,7 +193,7 @@ class AgentHost:
         self._hardware = modules
         self._transport = transport
         self._motion_listener = MotionListener()
-        self._from_others = Inbox(capacity=4096)
+        self._from_others = Inbox(MAX_MESSAGE_BYTES)
         self._findings: list[tuple[HostedModule, Finding]] = []
         self._listening: dict[str, Undeclare] = {}
         self._declared: list[Undeclare] = []

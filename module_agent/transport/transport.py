@@ -7,7 +7,6 @@ never blocks for long and may drop; a query is answered by exactly one `Reply`. 
 A `Reply` without payload carries one of the errors at the end of this file, the same for every transport.
 """
 
-from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -94,37 +93,6 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """End all declarations and the session. May be called twice."""
-
-
-class Inbox:
-    """Events for the cyclic executive, in order of arrival; a full one drops and counts what arrives.
-
-    `waiting` is the queue itself, true while there are events: the cheapest test in a tick.
-    """
-
-    __slots__ = ("_capacity", "dropped", "waiting")
-
-    def __init__(self, capacity: int = 256):
-        self.waiting: deque[Event] = deque()
-        self._capacity = capacity
-        self.dropped = 0
-
-    def put(self, event: Event) -> None:
-        """Enqueue from any thread; never blocks."""
-        if len(self.waiting) >= self._capacity:
-            self.dropped += 1
-        else:
-            self.waiting.append(event)
-
-    def drain(self, limit: int = 64) -> list[Event]:
-        """Take up to `limit` events, oldest first."""
-        events: list[Event] = []
-        while self.waiting and len(events) < limit:
-            events.append(self.waiting.popleft())
-        return events
-
-    def __len__(self) -> int:
-        return len(self.waiting)
 
 
 TIMEOUT = "Timeout"

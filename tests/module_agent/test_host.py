@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -24,6 +25,7 @@ from module_agent.wire.messages import (
     MotionRecord,
     Rest,
     Status,
+    Stop,
     WindowedSine,
 )
 from sim.robot.robot_tree import sensing_chain, true_chain
@@ -247,3 +249,48 @@ def test_modules_that_share_a_process_share_nothing_else(rigs: Callable[..., Any
         assert len(firsts) >= 14
         starts.append(int(unpack(found[0])["t_ns"][0]))
     assert len(set(starts)) == 4
+
+
+def _garbage(kind: str) -> bytes:
+    head = {"v": 1, "serial": TIP, "boot": 0, "seq": 1, "sender": "flood", "why": ""}
+    return {
+        "too_long": b"\x90" * 100_000,
+        "malformed": b"\xc1",
+        "version": msgpack.packb(head | {"v": 2}),
+        "types": msgpack.packb(head | {"sender": 5}),
+        "wrong_serial": msgpack.packb(head | {"serial": BASE}),
+        "wrong_boot": msgpack.packb(head | {"boot": 12345}),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["too_long", "malformed", "version", "types", "wrong_serial", "wrong_boot"])
+def test_a_stop_is_confirmed_within_100_ms_under_a_flood_on_its_own_key(
+    rigs: Callable[..., Any], kind: str
+) -> None:
+    """80 messages a tick are 80,000 a second, published and asked; the stop comes behind them, once."""
+    rig = rigs(ARM)
+    at = key(rig.robot.name, TIP, Leaf.STOP)
+    rig.run(asyncio.sleep(0.1))
+    flood, holder = rig.network.endpoint("flood"), rig.network.endpoint("holder")
+    answers: list[Any] = []
+
+    async def flooded() -> None:
+        for tick in range(60):
+            for number in range(40):
+                flood.publish(at, _garbage(kind))
+                flood.query(at, _garbage(kind), 0.05, lambda event: None, number)
+            if tick == 30:
+                stop = Stop(serial=TIP, boot=0, seq=1, sender="tester")
+                holder.query(at, encode(stop), 0.1, lambda event: answers.append((rig.loop.now_ns, event)), 1)
+                asked_ns = rig.loop.now_ns
+            await asyncio.sleep(0.001)
+        ((answered_ns, reply),) = answers
+        assert decode(Ack, reply.payload).accepted
+        assert answered_ns - asked_ns <= 10_000_000
+
+    rig.run(flooded())
+    module = rig.hosts[TIP].modules[0]
+    assert module.firmware.state == "stopped"
+    # What a flood of the longest messages pushes out is counted.
+    counted = module.firmware.admission.refusals.get(kind, 0) + module.firmware.dropped_events
+    assert counted > 4000

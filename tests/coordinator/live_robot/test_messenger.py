@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused
+from coordinator.live_robot.messenger import LANE_BYTES, Messenger, NoAnswer, Refused
 from coordinator.recording.recording import Entry, Recording
+from module_agent.transport.inbox import EVENT_BYTES
 from module_agent.transport.transport import Request, TransportError
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
@@ -169,11 +170,26 @@ def test_events_beyond_the_inbox_capacity_are_counted(bench: Bench) -> None:
     messenger = Messenger(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
     messenger.start()
     payload = encode(wire.status())
-    for _ in range(100_007):
+    room = LANE_BYTES // (EVENT_BYTES + len(payload))
+    for _ in range(room + 7):
         bench.module.publish(key(wire.robot, "A", Leaf.STATUS), payload)
     bench.run(asyncio.sleep(0.01))
     assert messenger.dropped == 7
     assert len(posted) == 1  # one call is under way however many events wait
+
+
+def test_messages_are_recorded_with_the_time_of_their_delivery(wire: SimpleNamespace) -> None:
+    bench, posted = Bench(wire), list[Callable[[], None]]()
+    endpoint = bench.network.endpoint("slow")
+    messenger = Messenger(endpoint, wire.robot, lambda: bench.loop.now_ns, posted.append, bench._record)
+    messenger.start()
+    bench.loop.run_until_complete(asyncio.sleep(0.005))
+    bench.module.publish(key(wire.robot, "A", Leaf.STATUS), encode(wire.status()))
+    # The event loop is busy for 0.2 s.
+    bench.loop.run_until_complete(asyncio.sleep(0.2))
+    posted[0]()
+    assert [entry.t_ns for entry in bench.entries] == [5_000_000]
+    bench.loop.close()
 
 
 def test_sequence_numbers_increase(bench: Bench) -> None:

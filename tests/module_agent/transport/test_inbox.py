@@ -1,47 +1,53 @@
-"""A bounded queue that keeps the oldest and counts what it had to turn away."""
+"""A bounded queue that keeps the oldest of every key, and counts what it had to turn away."""
 
 import threading
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.transport.transport import Event, Inbox, Sample
+from module_agent.transport.inbox import EVENT_BYTES, Inbox
+from module_agent.transport.transport import Event, Reply, Sample
+
+SIZE = EVENT_BYTES + 10
 
 
-def _event(number: int) -> Event:
-    return Sample("k", str(number).encode())
+def _event(number: int, key: str = "k") -> Event:
+    return Sample(key, b"%010d" % number)
 
 
 @given(
     capacity=st.integers(1, 8),
-    steps=st.lists(st.one_of(st.just("put"), st.integers(0, 10)), max_size=60),
+    steps=st.lists(st.one_of(st.sampled_from("ab"), st.integers(1, 10)), max_size=60),
 )
-def test_what_is_kept_comes_out_once_in_order_and_the_rest_is_counted(
+def test_of_every_key_the_oldest_come_out_once_in_order_and_the_rest_is_counted(
     capacity: int, steps: list[str | int]
 ) -> None:
-    inbox = Inbox(capacity)
-    waiting: list[Event] = []
+    inbox = Inbox(100, lane_bytes=capacity * SIZE)
+    waiting: dict[str, list[Event]] = {"a": [], "b": []}
     offered, taken, dropped = 0, 0, 0
     for step in steps:
         if isinstance(step, int):
             got = inbox.drain(limit=step)
-            assert got == waiting[:step]
-            del waiting[:step]
+            assert got == sorted(got, key=lambda event: event.payload)
+            share = max(1, step // max(1, sum(map(bool, waiting.values()))))
+            for key, events in waiting.items():
+                assert [event for event in got if event.key == key] == events[:share]
+                del events[:share]
             taken += len(got)
         else:
             offered += 1
-            inbox.put(_event(offered))
-            if len(waiting) < capacity:
-                waiting.append(_event(offered))
+            inbox.put(_event(offered, step))
+            if len(waiting[step]) < capacity:
+                waiting[step].append(_event(offered, step))
             else:
                 dropped += 1
-        assert len(inbox) == len(waiting) <= capacity
+        assert inbox.waiting == any(waiting.values())
         assert inbox.dropped == dropped
     assert offered == taken + dropped + len(inbox)
 
 
 def test_threads_that_put_at_once_lose_nothing_uncounted() -> None:
-    inbox = Inbox(capacity=10_000)
+    inbox = Inbox(100, lane_bytes=1 << 20)
     threads = [threading.Thread(target=lambda: [inbox.put(_event(i)) for i in range(1000)]) for _ in range(4)]
     for thread in threads:
         thread.start()
@@ -49,3 +55,29 @@ def test_threads_that_put_at_once_lose_nothing_uncounted() -> None:
         thread.join()
     assert len(inbox.drain(limit=10_000)) + inbox.dropped == 4000
     assert inbox.dropped == 0
+
+
+def test_a_flood_on_one_key_pushes_out_nothing_of_another_even_when_all_is_full() -> None:
+    inbox = Inbox(100, lane_bytes=90 * SIZE, total_bytes=100 * SIZE)
+    for number in range(1000):
+        inbox.put(_event(number, f"flood/{number % 2}"))
+    for number in range(20):
+        inbox.put(_event(number, "quiet"))
+    kept = inbox.drain(limit=10_000)
+    assert len(kept) == 100
+    assert sum(event.key == "quiet" for event in kept) == 20
+
+
+def test_an_answer_is_kept_however_full_it_is() -> None:
+    inbox = Inbox(100, lane_bytes=SIZE, total_bytes=2 * SIZE)
+    inbox.put(_event(1))
+    for tag in range(10):
+        inbox.put(Reply(tag, "k", b"answer"))
+    assert sum(isinstance(event, Reply) for event in inbox.drain(limit=100)) == 10
+
+
+def test_a_payload_longer_than_any_message_takes_no_more_room_than_one() -> None:
+    inbox = Inbox(100)
+    inbox.put(Sample("k", bytes(1 << 20)), stamp=7)
+    ((stamp, event),) = inbox.drain_stamped(1)
+    assert (stamp, event) == (7, Sample("k", bytes(101)))
