@@ -16,6 +16,7 @@ from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import SIGNALS, ignore_signals
 from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, UsageError
+from module_agent.model.files import write_text
 from sim.processes.fleet import FleetConfig, run_fleet
 from sim.processes.fleet_figures import summary, table_rows
 from sim.processes.fleet_plan import plan_fleet
@@ -37,12 +38,16 @@ def fleet(
     port: Annotated[
         int | None, typer.Option(min=1024, max=65000, help="First port of the routers [free ones].")
     ] = None,
+    move: Annotated[
+        bool, typer.Option("--move", help="Hold all joints and move one of each robot at a time.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for logs and truths [a temporary one].")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
 ) -> None:
     """Run several robots with a coordinator each on Zenoh routers, and measure what they cost.
 
-    The modules stand still; coordinators receive all rows and request each module's status in turn.
+    Coordinators receive all rows and request each module's status in turn; the modules stand still, or with
+    `--move` their joints move in turn while the others hold.
 
     Examples: `x5-sim fleet --robots 2 --modules 4 --seconds 10`;
     `x5-sim fleet --robots 8 --modules 16 --routers 3 --speed 0.2 --json runs/fleet.json`.
@@ -63,7 +68,7 @@ def fleet(
     with ExitStack() as opened:
         folder = out or Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="x5-fleet-")))
         try:
-            figures = run_fleet(FleetConfig(plan, folder, seconds, speed, seed), _note)
+            figures = run_fleet(FleetConfig(plan, folder, seconds, speed, seed, move), _note)
         except LaunchError as error:
             fail(str(error), EXIT_FAILED)
     table = new_table(None, "process | number | CPU % | MiB | threads | sockets")
@@ -73,7 +78,7 @@ def fleet(
     typer.echo(summary(figures))
     if json_file is not None:
         kinds = {kind: each._asdict() for kind, each in figures.kinds.items()}
-        json_file.write_text(json.dumps({**figures._asdict(), "kinds": kinds}, indent=1) + "\n")
+        write_text(json_file, json.dumps({**figures._asdict(), "kinds": kinds}, indent=1) + "\n")
 
 
 def _endpoints(count: int, first_port: int | None) -> tuple[str, ...]:

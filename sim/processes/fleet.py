@@ -40,13 +40,14 @@ _GRACE_S = 60.0
 
 
 class FleetConfig(NamedTuple):
-    """How long and how fast a fleet runs, and the folder of its logs."""
+    """How long and how fast a fleet runs, whether its robots move, and the folder of its logs."""
 
     plan: FleetPlan
     out: Path
     seconds: float
     speed: float = 1.0
     seed: int = 0
+    moves: bool = False
 
 
 def run_fleet(config: FleetConfig, report: Callable[[str], None]) -> FleetFigures:
@@ -76,9 +77,8 @@ def run_fleet(config: FleetConfig, report: Callable[[str], None]) -> FleetFigure
             children["world"].append(launcher.start_world())
             children["agent"] += launcher.start_agents()
             counted, where = str(len(robot.serials)), f"coordinator-{robot.name}"
-            start(
-                "coordinator", where, robot.name, config.plan.root, counted, str(config.seconds), str(begin)
-            )
+            what = (robot.name, config.plan.root, counted, str(config.seconds), str(begin))
+            start("coordinator", where, *what, *(("move",) if config.moves else ()))
             report(f"{robot.name}: {counted} modules in {robot.processes} processes started")
         _wait_until_up([*children["agent"], *children["coordinator"]])
         report(f"all {config.plan.module_count} modules answer; measuring for {config.seconds:g} s")
@@ -139,7 +139,8 @@ def _measure(
     heard = [_heard(child) for child in children["coordinator"]]
     real_time, lost = min(each.real_time for each in heard), sum(each.rows_lost for each in heard)
     unanswered = sum(each.unanswered for each in heard)
-    broke += missed(real_time, config.speed, lost, unanswered)
+    failed = sum(each.motions_failed for each in heard)
+    broke += missed(real_time, config.speed, lost, unanswered, failed)
     p50, p99 = percentiles_ms([trip for each in heard for trip in each.round_trips_ms])
     kinds = {kind: of_kind(before[kind], after[kind], spent_s) for kind in children}
     cpu_us_per_s = 1e4 * sum(each.cpu_percent for each in kinds.values())
@@ -161,6 +162,8 @@ def _measure(
         us_per_module_tick=cpu_us_per_s / ticks_per_s if ticks_per_s else float("nan"),
         kinds=kinds,
         broke=tuple(broke),
+        motions=sum(each.motions for each in heard),
+        motions_failed=failed,
     )
 
 

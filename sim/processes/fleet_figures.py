@@ -33,7 +33,8 @@ class FleetFigures(NamedTuple):
     """What a fleet measured; `kinds` by the kind of process, `broke` in order of time.
 
     round_trip_ms: a status request and its answer, 50 and 99 %. real_time: of the slowest robot.
-    us_per_module_tick: CPU of all processes over ticks of all modules [us].
+    us_per_module_tick: CPU of all processes over ticks of all modules [us]. motions: of robots that move, one
+    joint each at a time, that came to their end, and that did not.
     """
 
     robots: int
@@ -50,6 +51,8 @@ class FleetFigures(NamedTuple):
     us_per_module_tick: float
     kinds: dict[str, KindFigures]
     broke: tuple[str, ...]
+    motions: int = 0
+    motions_failed: int = 0
 
 
 def read_process(pid: int, ticks_per_s: int) -> Reading:
@@ -87,7 +90,9 @@ def of_kind(before: list[Reading], after: list[Reading], seconds: float) -> Kind
     )
 
 
-def missed(real_time: float, asked: float, rows_lost: int, unanswered: int) -> list[str]:
+def missed(
+    real_time: float, asked: float, rows_lost: int, unanswered: int, motions_failed: int = 0
+) -> list[str]:
     """Return in words what did not hold."""
     faults = []
     if real_time < HELD_REAL_TIME * asked:
@@ -96,6 +101,8 @@ def missed(real_time: float, asked: float, rows_lost: int, unanswered: int) -> l
         faults.append(f"network: {rows_lost} rows lost")
     if unanswered:
         faults.append(f"network: {unanswered} requests unanswered")
+    if motions_failed:
+        faults.append(f"motions: {motions_failed} did not come to their end")
     return faults
 
 
@@ -134,6 +141,7 @@ def summary(figures: FleetFigures) -> str:
             f"request and answer: 50 % within {figures.round_trip_p50_ms:.1f} ms, 99 % within "
             f"{figures.round_trip_p99_ms:.1f} ms, {figures.unanswered} unanswered",
             f"CPU: {figures.us_per_module_tick:.0f} us for each module and tick",
+            *([f"motions: {figures.motions} done, {figures.motions_failed} not"] if figures.motions else []),
             f"broke first: {figures.broke[0] if figures.broke else 'nothing'}",
         )
     )

@@ -1,7 +1,7 @@
-"""The processes that only a fleet has: a router, and a coordinator that listens and asks but moves nothing.
+"""The processes that only a fleet has: a router, and a coordinator that listens, asks, may move its robot.
 
 `python -m sim.processes.fleet_member router ENDPOINT [PARENT]`
-`python -m sim.processes.fleet_member coordinator ROBOT ROUTER MODULES SECONDS BEGIN`
+`python -m sim.processes.fleet_member coordinator ROBOT ROUTER MODULES SECONDS BEGIN [move]`
 """
 
 import asyncio
@@ -9,6 +9,8 @@ import json
 import signal
 import sys
 import time
+from contextlib import suppress
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,17 +19,21 @@ import numpy as np
 from coordinator.api import LiveRobot, connect
 from module_agent.model.errors import RobotError
 from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
+from module_agent.wire.messages import WindowedSine
 
 READY = "ready"
 ASK_EVERY_S = 0.5
 START_TIMEOUT_S = 120.0
+# Of one joint, while all others hold; short, since a coordinator waits only 3 s beyond a motion's own time.
+MOTION = WindowedSine(amplitude=0.05, centre_s=0.25, sigma_s=0.1)
 
 
 class Heard(NamedTuple):
     """What a coordinator measured: rows, and round trips of a status request [ms].
 
     rows_lost: numbers that are missing between the first and the last row. unanswered: requests.
-    real_time: least module time that passed, over the time here.
+    real_time: least module time that passed, over the time here. motions: that came to their end, and that
+    did not.
     """
 
     rows: int
@@ -36,6 +42,8 @@ class Heard(NamedTuple):
     round_trips_ms: tuple[float, ...]
     real_time: float
     seconds: float
+    motions: int = 0
+    motions_failed: int = 0
 
 
 def route(endpoint: str, parent: str | None) -> None:
@@ -48,14 +56,41 @@ def route(endpoint: str, parent: str | None) -> None:
     transport.close()
 
 
-async def coordinate(robot: str, router: str, modules: int, seconds: float, begin: Path) -> None:
-    """Meet the modules, wait for the file `begin`, listen and ask for `seconds`, print what was heard."""
+async def coordinate(robot: str, router: str, modules: int, seconds: float, begin: Path, moves: bool) -> None:
+    """Meet the modules, wait for the file `begin`, listen and ask for `seconds`, print what was heard.
+
+    A robot that `moves` is held, and its joints move in turn.
+    """
     async with connect(robot, routers=(router,), expect=modules, timeout_s=START_TIMEOUT_S) as arm:
+        if moves:
+            await arm.hold()
         print(READY, flush=True)
         while not begin.exists():
             await asyncio.sleep(0.05)
+        done: list[bool] = []
+        mover = asyncio.create_task(_move(arm, done)) if moves else None
         heard = await _listen(arm, seconds)
+        if mover is not None:
+            mover.cancel()
+            with suppress(asyncio.CancelledError):
+                await mover
+    heard = heard._replace(motions=done.count(True), motions_failed=done.count(False))
     print(json.dumps(heard._asdict()), flush=True)
+
+
+async def _move(arm: LiveRobot, done: list[bool]) -> None:
+    """Move one joint after the other until cancelled; note of each motion whether it came to its end."""
+    for serial in cycle(arm.serials):
+        try:
+            await arm.group.run({serial: MOTION})
+        except RobotError:
+            done.append(False)
+            # It may have expired: what is too slow for its keep-alives is counted, and goes on.
+            with suppress(RobotError):
+                await arm.group.acquire(serial)
+            await asyncio.sleep(ASK_EVERY_S)
+        else:
+            done.append(True)
 
 
 async def _listen(arm: LiveRobot, seconds: float) -> Heard:
@@ -98,8 +133,9 @@ def main(arguments: list[str]) -> None:
     match arguments:
         case ["router", endpoint, *parent]:
             route(endpoint, parent[0] if parent else None)
-        case ["coordinator", robot, router, modules, seconds, begin]:
-            asyncio.run(coordinate(robot, router, int(modules), float(seconds), Path(begin)))
+        case ["coordinator", robot, router, modules, seconds, begin, *move]:
+            moves = move == ["move"]
+            asyncio.run(coordinate(robot, router, int(modules), float(seconds), Path(begin), moves))
         case _:
             raise SystemExit(__doc__)
 
