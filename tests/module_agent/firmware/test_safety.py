@@ -8,9 +8,9 @@ from module_agent.control.safety import Safety
 from module_agent.firmware.firmware import Incoming, Publication
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf
-from module_agent.wire.messages import Ask, GoTo, Info, LeaseRequest, Rest, Status, Stop
+from module_agent.wire.messages import Ask, EstimateRequest, GoTo, Info, LeaseRequest, Rest, Status, Stop
 from module_agent.wire.refusal import Refusal
-from tests.module_agent.firmware_bench import Bench, refused
+from tests.module_agent.firmware_bench import BOOT, Bench, refused
 
 NARROW = Safety(position_rad=(-0.5, 0.5))
 
@@ -233,3 +233,36 @@ def test_release_needs_no_m_stop_to_be_released() -> None:
     one.tick()
     assert one.ask(Leaf.LEASE, LeaseRequest(**one.head(action="release"))).accepted
     assert one.firmware.state == "idle"
+
+
+# ------------------------------------------------------------------ what is left
+
+
+def test_a_motion_that_is_no_rest_leaves_the_last_rest() -> None:
+    one = Bench()
+    one.acquire()
+    one.move(1, Rest(duration_s=0.05))
+    one.ticks(60)
+    one.move(2, GoTo(target_rad=0.21, max_speed_rad_s=1.0))
+    one.ticks(200)
+    assert one.status().motion is not None
+    assert one.firmware.last_rest is not None
+    assert one.firmware.last_rest.motion_id == 1
+
+
+def test_a_message_that_the_firmware_does_not_answer_is_refused() -> None:
+    one = Bench()
+    question = EstimateRequest(serial="A", boot=BOOT, seq=1, sender="x", joint="B")
+    answer = one.ask(Leaf.ESTIMATE, question)
+    assert refused(answer, Refusal.MALFORMED)
+    assert "estimate is not answered by the firmware" in answer.detail
+
+
+def test_a_copy_of_an_acquisition_changes_nothing() -> None:
+    one = Bench()
+    grant = encode(LeaseRequest(**one.head(action="acquire")))
+    assert one.ask(Leaf.LEASE, grant).accepted
+    one.setpoint(0.3)
+    assert one.ask(Leaf.LEASE, grant).accepted
+    assert one.firmware.state == "streaming"
+    assert one.firmware.lease.token == 1

@@ -138,3 +138,33 @@ def test_a_module_shows_which_one_it_is_until_it_is_told_otherwise() -> None:
     assert bench.modules.identified == ("A",)
     bench.modules.identify(0, False)
     assert bench.modules.identified == ()
+
+
+def test_there_is_one_command_per_module_after_a_first_sample() -> None:
+    bench = Bench()
+    with pytest.raises(ValueError, match=r"1 commands for 1 modules, 0 of them have been read"):
+        bench.modules.send([PUSH])
+    bench.receive()
+    with pytest.raises(ValueError, match=r"2 commands for 1 modules, 1 of them have been read"):
+        bench.modules.send([PUSH, PUSH])
+
+
+@pytest.mark.parametrize("lifetime_ns", [0, -MS])
+def test_a_lifetime_is_positive(lifetime_ns: int) -> None:
+    with pytest.raises(ValueError, match="it must be over 0"):
+        Bench().modules.set_lifetime(0, lifetime_ns)
+
+
+def test_a_lifetime_is_that_of_its_module() -> None:
+    bench = Bench()
+    bench.modules.set_lifetime(0, 3 * MS)
+    bench.receive()
+    bench.modules.send([PUSH])
+    assert [bench.receive().pwm for _ in range(7)] == [0.9] * 4 + [0.0] * 3
+
+
+def test_after_close_the_motor_is_off() -> None:
+    bench = Bench()
+    bench.drive(PUSH)
+    bench.modules.close()
+    assert bench.wires.pwm[-1] == 0.0
