@@ -5,17 +5,22 @@ import os
 import secrets
 import signal
 import sys
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from module_agent.control.safety import Safety
 from module_agent.control.safety_file import read_safety
 from module_agent.firmware.config import config_of
 from module_agent.hardware.bus_client import BusClient
-from module_agent.hardware.hardware import HardwareLost
+from module_agent.hardware.hardware import HardwareLost, Modules
+from module_agent.hardware.hebi_library import HEBI
+from module_agent.hardware.hebi_library import library as hebi_library
+from module_agent.hardware.hebi_network import HebiOptions, open_modules, seen
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
@@ -87,8 +92,24 @@ def _transport(
 
 @app.command()
 def main(
-    serial: Annotated[list[str], typer.Option(help="Serial of a module to run; repeat for several.")],
-    bus: Annotated[str, typer.Option(help="Path of the physics bus of the world.")],
+    serial: Annotated[
+        list[str] | None, typer.Option(help="Serial of a module to run; repeat for several.")
+    ] = None,
+    bus: Annotated[str, typer.Option(help="Path of the physics bus of the world.")] = "",
+    hebi: Annotated[bool, typer.Option("--hebi", help="Run real HEBI modules, in place of a bus.")] = False,
+    family: Annotated[str, typer.Option(help="HEBI: family of the modules.")] = "HEBI",
+    name: Annotated[
+        list[str] | None, typer.Option(help="HEBI: name of a module; repeat for several [all of the family].")
+    ] = None,
+    module_type: Annotated[
+        list[str] | None,
+        typer.Option("--type", help="HEBI: type of each module, in their order [what they tell]."),
+    ] = None,
+    rate: Annotated[float, typer.Option(help="HEBI: ticks a second, each a command and a feedback.")] = 250.0,
+    list_modules: Annotated[
+        bool, typer.Option("--list", help="HEBI: list the modules on the network, and end.")
+    ] = False,
+    library: Annotated[str, typer.Option(hidden=True, help="What stands in for hebi-py.")] = HEBI,
     robot: Annotated[str, typer.Option(help="Name of the robot, part of every key.")] = "robot",
     connect: Annotated[
         list[str] | None,
@@ -117,7 +138,65 @@ def main(
     ] = None,
     imu: Annotated[ImuKind, typer.Option(help="Calibration of the modules' IMUs.")] = "uncalibrated",
 ) -> None:
-    """Run the agent of one or several modules until the world ends or a signal comes."""
+    """Run the agent of one or several modules until the world ends or a signal comes.
+
+    Simulated modules are those of a world on a physics bus (--serial, --bus), real ones those on HEBI's
+    network (--hebi --family F --name N).
+    """
+    if hebi and list_modules:
+        _list(library)
+        return
+    options = HebiOptions(family, tuple(name or ()), tuple(module_type or ()), rate, library)
+    settings = {
+        "feedback_rate_hz": feedback_rate,
+        "lifetime_ns": round(lifetime_ms * 1e6),
+        "expiry_action": expiry,
+        "strategy": strategy,
+        "imu": imu,
+    }
+
+    def open_transport(serials: list[str]) -> Transport:
+        known = host_credentials(secure, robot, serials) if secure else None
+        return _transport(connect or [DEFAULT_ENDPOINT], listen or [], network_named(network), seed, known)
+
+    with _usage_errors():
+        check_chunk("robot", robot)
+        network_named(network)
+        _check_expiry(expiry, hebi)
+        if not hebi and not (serial and bus):
+            raise UsageError("give --serial and --bus for simulated modules, or --hebi for real ones")
+        if hebi and safety:
+            raise UsageError(
+                "--safety with --hebi: set the safety parameters of real modules in HEBI's own tools"
+            )
+        limits = read_safety(safety, serial or []) if safety else {}
+    _run(robot, options if hebi else _OnBus(bus, tuple(serial or ()), limits), open_transport, settings)
+
+
+class _OnBus(NamedTuple):
+    """Simulated modules on a physics bus."""
+
+    path: str
+    serials: tuple[str, ...]
+    limits: Mapping[str, Safety]
+
+
+@contextmanager
+def _usage_errors() -> Iterator[None]:
+    try:
+        yield
+    except (RobotError, OSError) as error:
+        typer.echo(f"x5-agent: {error}", err=True)
+        raise typer.Exit(EXIT_USAGE) from error
+
+
+def _run(
+    robot: str,
+    source: HebiOptions | _OnBus,
+    open_transport: Callable[[list[str]], Transport],
+    settings: dict[str, Any],
+) -> None:
+    """Open modules and network, and serve until the modules are gone or a signal comes."""
     # Imported here: it brings the estimators, which `--help` does not need.
     from module_agent.host import AgentHost
 
@@ -126,40 +205,55 @@ def main(
     # Estimates run on a second thread; a tick must not wait for it the default 5 ms.
     sys.setswitchinterval(0.0005)
     with ExitStack() as opened:
-        try:
-            check_chunk("robot", robot)
-            injected = network_named(network)
-            if expiry not in ("motor_off", "hold", "damping"):
-                raise UsageError(f"--expiry {expiry}: it must be motor_off, hold or damping")
-            limits = read_safety(safety, serial) if safety else {}
-            known = host_credentials(secure, robot, serial) if secure else None
-            transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed, known)
-            opened.callback(transport.close)
-            # A full collection of what the imports have left takes 38 ms, in which no tick would run: it is
-            # made once, and they are not looked at again.
-            gc.collect()
-            gc.freeze()
-            # The world waits for every agent on its bus, so the bus comes last.
-            modules = LoopInside(BusClient(bus, serial), limits)
-            opened.callback(modules.close)
-            configs = [
-                config_of(
-                    module,
-                    secrets.randbits(64),
-                    feedback_rate_hz=feedback_rate,
-                    lifetime_ns=round(lifetime_ms * 1e6),
-                    expiry_action=expiry,
-                    strategy=strategy,
-                    imu=imu,
-                )
-                for module in modules.information
-            ]
+        with _usage_errors():
+            modules: Modules
+            if isinstance(source, HebiOptions):
+                modules = open_modules(source)
+                opened.callback(modules.close)
+                transport = open_transport([module.serial for module in modules.information])
+                opened.callback(transport.close)
+                _settle()
+            else:
+                transport = open_transport(list(source.serials))
+                opened.callback(transport.close)
+                _settle()
+                # The world waits for every agent on its bus, so the bus comes last.
+                modules = LoopInside(BusClient(source.path, source.serials), source.limits)
+                opened.callback(modules.close)
+            configs = [config_of(module, secrets.randbits(64), **settings) for module in modules.information]
             host = AgentHost(robot, modules, transport, configs, worker := ThreadWorker())
-        except (RobotError, OSError) as error:
-            typer.echo(f"x5-agent: {error}", err=True)
-            raise typer.Exit(EXIT_USAGE) from error
         opened.pop_all()
     _serve(host, worker)
+
+
+def _settle() -> None:
+    # A full collection of what the imports have left takes 38 ms, in which no tick would run: it is made
+    # once, and they are not looked at again.
+    gc.collect()
+    gc.freeze()
+
+
+def _check_expiry(expiry: str, hebi: bool) -> None:
+    possible = ("motor_off", "hold") if hebi else ("motor_off", "hold", "damping")
+    if expiry not in possible:
+        raise UsageError(
+            f"--expiry {expiry}: it must be {', '.join(possible[:-1])} or {possible[-1]}"
+            + (" with --hebi: a real module damps by a command, and has none when it expires" if hebi else "")
+        )
+
+
+def _list(library: str) -> None:
+    with _usage_errors():
+        modules = seen(hebi_library(library))
+    rows = [("family", "name", "serial", "type", "firmware", "address")]
+    rows += [(m.family, m.name, m.serial, m.mechanical_type, m.firmware, m.address) for m in modules]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        typer.echo("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
+    if not modules:
+        typer.echo(
+            "x5-agent: no HEBI module answers: is this host on their network, and are they on?", err=True
+        )
 
 
 def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
@@ -169,7 +263,7 @@ def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
         while True:
             host.cycle()
     except HardwareLost as error:
-        typer.echo(f"x5-agent: {names}: the world is gone: {error}", err=True)
+        typer.echo(f"x5-agent: {names}: the modules are gone: {error}", err=True)
         raise typer.Exit(EXIT_LOST) from error
     finally:
         # The end of the world is mostly followed by a signal that ends the agents too: one in the middle of

@@ -42,7 +42,8 @@ class Notes:
 class Rig(VirtualRobot):
     """World, network and agents of one robot that ticks from the start; `cut` severs the coordinator from it.
 
-    `beside` is a rig whose network, and with it whose time, this one shares.
+    `beside` is a rig whose network, and with it whose time, this one shares. `hebi_rate_hz` as in
+    `VirtualSettings`.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Rig(VirtualRobot):
         tap: Callable[[int, str, str, str, bytes], None] | None = None,
         noise: str = "x5",
         beside: "Rig | None" = None,
+        hebi_rate_hz: float | None = None,
         **firmware: Any,
     ):
         self._guest = beside is not None
@@ -60,7 +62,8 @@ class Rig(VirtualRobot):
         loop = VirtualLoop() if beside is None else beside.loop
         shared = VirtualNetwork(loop, tap) if beside is None else beside.network
         impaired = PROFILES[network] if isinstance(network, str) else network
-        super().__init__(VirtualSettings(load_robot(robot), impaired, seed, noise), loop, shared, **firmware)
+        settings = VirtualSettings(load_robot(robot), impaired, seed, noise, hebi_rate_hz=hebi_rate_hz)
+        super().__init__(settings, loop, shared, **firmware)
         self.start()
 
     def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:

@@ -17,6 +17,7 @@ from module_agent.control.safety_file import safety_toml
 from module_agent.main import ATTACHED
 from module_agent.model.errors import RobotError
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from sim.hebi_stand_in import on_bus
 from sim.physics.engine import Physics
 from sim.robot.noise_choice import NoiseChoice
 
@@ -30,6 +31,7 @@ _MAX_NAME = 100
 # A process is woken once a tick whatever it hosts: eight modules in one cost a sixth of eight processes.
 MODULES_PER_PROCESS = 8
 _PR_SET_PDEATHSIG = 1
+EMPTY: Mapping[str, str] = MappingProxyType({})
 
 
 class LaunchError(RobotError):
@@ -49,7 +51,8 @@ class LaunchConfig(NamedTuple):
     `within` maps the name of a process ("world", "coordinator", or "agent" and its serials) to the command
     that it is run by, such as `nsenter` with a network namespace. `secure` is a folder of keys.
     `safety` are the limits of the modules by serial, which the agents read from `safety.toml` in the run's
-    folder.
+    folder. With `hebi` the agents speak to the modules through the driver of real ones, over a stand-in for
+    hebi-py.
     """
 
     robot_file: str
@@ -68,6 +71,7 @@ class LaunchConfig(NamedTuple):
     pushes: tuple[str, ...] = ()
     imu_rate_hz: float = 250.0
     physics: Physics = "pybullet"
+    hebi: bool = False
     secure: Path | None = None
     safety: Mapping[str, Safety] = MappingProxyType({})
 
@@ -144,14 +148,20 @@ class Launcher:
     def start_agent(self, serials: Sequence[str], index: int = 0) -> Child:
         """Start one agent process that hosts these modules."""
         config = self.config
-        arguments = ["module_agent.main", "--bus", self.bus, "--robot", config.robot_name]
+        arguments = ["module_agent.main", "--robot", config.robot_name]
         arguments += ["--connect", config.endpoint, "--network", config.network]
         arguments += ["--seed", str(1000 * config.seed + index + 1), *config.secured, *config.agent_options]
         if config.safety:
             arguments += ["--safety", str(config.out / SAFETY)]
+        environment = {}
+        if config.hebi:
+            arguments += ["--hebi", "--library", on_bus.__name__, "--family", on_bus.FAMILY]
+            environment = {on_bus.BUS: self.bus, on_bus.SERIALS: ",".join(serials)}
+        else:
+            arguments += ["--bus", self.bus]
         for serial in serials:
-            arguments += ["--serial", serial]
-        agent = self._start(f"agent {','.join(serials)}", arguments, up=ATTACHED)
+            arguments += ["--name" if config.hebi else "--serial", serial]
+        agent = self._start(f"agent {','.join(serials)}", arguments, up=ATTACHED, environment=environment)
         self._waited_for.append(agent)
         return agent
 
@@ -173,9 +183,16 @@ class Launcher:
         paths = [folder / f"{stem}.log", *(folder / f"{stem}-{k}.log" for k in range(2, len(taken) + 3))]
         return next(path for path in paths if path not in taken)
 
-    def _start(self, name: str, arguments: Sequence[str], quiet: bool = True, up: str = "") -> Child:
+    def _start(
+        self,
+        name: str,
+        arguments: Sequence[str],
+        quiet: bool = True,
+        up: str = "",
+        environment: Mapping[str, str] = EMPTY,
+    ) -> Child:
         log = self._log(name) if quiet else None
-        child = start_child(name, arguments, log, self.config.within(name), up)
+        child = start_child(name, arguments, log, self.config.within(name), up, environment)
         self.children.append(child)
         self._report(f"{name}: process {child.process.pid}")
         return child
@@ -228,9 +245,17 @@ class Launcher:
 
 
 def start_child(
-    name: str, arguments: Sequence[str], log: Path | None, within: Sequence[str] = (), up: str = ""
+    name: str,
+    arguments: Sequence[str],
+    log: Path | None,
+    within: Sequence[str] = (),
+    up: str = "",
+    environment: Mapping[str, str] = EMPTY,
 ) -> Child:
-    """Start `python -m arguments`; its output goes to the log, or to this terminal without one."""
+    """Start `python -m arguments`; its output goes to the log, or to this terminal without one.
+
+    `environment` is in addition to that of this process.
+    """
     with open(log if log is not None else os.devnull, "wb") as output:
         # Its own session: Ctrl-C reaches the launcher alone, which then stops the others in order.
         process = subprocess.Popen(
@@ -240,7 +265,7 @@ def start_child(
             stderr=subprocess.STDOUT if log is not None else None,
             start_new_session=True,
             preexec_fn=_die_with_parent,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **environment},
         )
     return Child(name, process, log, up)
 

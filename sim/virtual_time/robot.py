@@ -12,12 +12,16 @@ from coordinator.runtime.event_loop import Interruption, run_to_end
 from module_agent.control.safety import Safety
 from module_agent.firmware.config import config_of
 from module_agent.firmware.quiet_ticks import QUIET, QuietTicks
-from module_agent.hardware.hardware import SensorSample, WiredModule
+from module_agent.hardware.hardware import Modules, SensorSample, WiredModule
+from module_agent.hardware.hebi_modules import HebiModules
+from module_agent.hardware.hebi_network import describe
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.transport.transport import Transport
+from sim.hebi_stand_in.library import Group, StandIn
+from sim.hebi_stand_in.modules import ModuleNetwork
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot
@@ -35,7 +39,8 @@ class VirtualSettings(NamedTuple):
 
     `noise_seed` makes it another day of the same robot: other noise and network, the same modules.
     `pushes` act on the world from outside; `physics` is the engine that moves its bodies. `safety` are the
-    limits of modules by serial; the others have their type's.
+    limits of modules by serial; the others have their type's. With `hebi_rate_hz` the agents speak to the
+    modules at this rate through the driver of real ones, over a stand-in for hebi-py.
     """
 
     robot: Robot
@@ -47,6 +52,7 @@ class VirtualSettings(NamedTuple):
     imu_rate_hz: float = 250.0
     physics: Physics | None = None
     safety: Mapping[str, Safety] = MappingProxyType({})
+    hebi_rate_hz: float | None = None
 
 
 class Wire:
@@ -113,6 +119,9 @@ class VirtualRobot:
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.serials)
         self._quiet = QuietTicks(len(self.serials))
+        self._hebi_rate_hz = settings.hebi_rate_hz
+        self.hebi = None if settings.hebi_rate_hz is None else ModuleNetwork(self.world.modules)
+        self._ticks = 0
         self.on_tick: list[Callable[[], None]] = []
         self._profile = settings.profile
         self._safety = settings.safety
@@ -144,14 +153,25 @@ class VirtualRobot:
     def boot(self, serial: str, **firmware: Any) -> None:
         """Start the agent of a module under a new boot id; `firmware` are settings of this module alone."""
         place = self._index[serial]
-        modules = LoopInside(Wire(self, place), self._safety)
+        modules = self._modules(place)
         config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)._replace(
             **firmware
         )
         endpoint = self.endpoint(serial)
         self.hosts[serial] = AgentHost(
-            self.robot.name, modules, endpoint, [config], InlineWorker(), self._quiet, place
+            *(self.robot.name, modules, endpoint, [config], InlineWorker()),
+            *((self._quiet, place) if self.hebi is None else ()),
         )
+
+    def _modules(self, place: int) -> Modules:
+        """Return the hardware of one module's agent: the simulated module, or the driver of real ones."""
+        if self.hebi is None or self._hebi_rate_hz is None:
+            return LoopInside(Wire(self, place), self._safety)
+        library = StandIn(self.hebi)
+        group = Group([self.hebi.all[place]], lambda: True)
+        information = describe(library, group, self._hebi_rate_hz)
+        # The robot's tick calls the agents when they are due.
+        return HebiModules(library, group, information, lambda: None)
 
     def start(self) -> None:
         """Begin to tick."""
@@ -161,6 +181,24 @@ class VirtualRobot:
     def _tick(self) -> None:
         if not self._running:
             return
+        if self.hebi is None:
+            self._tick_agents()
+        else:
+            self._tick_hebi(self.hebi)
+        for call in self.on_tick:
+            call()
+        self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
+
+    def _tick_hebi(self, modules: ModuleNetwork) -> None:
+        """Let the modules tick by themselves, and all agents where a tick of theirs is due."""
+        self.pwm[:] = modules.tick(self.truth.exchange(self.pwm))
+        self._ticks += 1
+        if self._ticks % round(1e9 / (TICK_NS * (self._hebi_rate_hz or 1.0))) == 0:
+            for host in list(self.hosts.values()):
+                host.cycle()
+
+    def _tick_agents(self) -> None:
+        """Let all agents tick, with the loops of their modules."""
         hosts, quiet = list(self.hosts.items()), self._quiet
         busy = [place for _, host in hosts for place in host.collect()]
         readings = self.truth.exchange(self.pwm)
@@ -171,18 +209,20 @@ class VirtualRobot:
         pwm = quiet.pwm.tolist()
         for serial, _ in hosts:
             self.pwm[self._index[serial]] = pwm[self._index[serial]]
-        for call in self.on_tick:
-            call()
-        self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
 
     def kill(self, serial: str) -> None:
-        """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone."""
+        """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone.
+
+        A module on HEBI's network goes on under its last command for the command's lifetime.
+        """
         self.freeze(serial)
         self.network.kill(serial)
 
     def freeze(self, serial: str) -> None:
         """Run an agent no more, as SIGSTOP does: its motor gets zero PWM, its endpoint stays."""
         del self.hosts[serial]
+        if self.hebi is not None:
+            return
         self._quiet.detach(self._index[serial])
         self.pwm[self._index[serial]] = 0.0
 

@@ -44,6 +44,8 @@ ROOT = Path(__file__).parents[2]
 # No test waits this long unless it fails: the machine may be slow and shared.
 LIMIT_S = 90.0
 MARK = "X5_INTEGRATION_TEST"
+# All of these tests over the driver of real modules and what stands in for hebi-py; by default a few are.
+THROUGH_THE_DRIVER = "X5_TEST_HEBI" in os.environ
 
 # A whole session in 14 s (27 s with dynamics): shorter motions, everything else as shipped.
 SHORT_PLAN = """
@@ -185,7 +187,9 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
     """
     made: list[Launcher] = []
 
-    def make(robot: str = "thesis_171_horizontal", network: str = "lan", lifetime_ms: int = 800) -> Launcher:
+    def make(
+        robot: str = "thesis_171_horizontal", network: str = "lan", lifetime_ms: int = 800, hebi: bool = False
+    ) -> Launcher:
         config = LaunchConfig(
             robot_file=robot,
             robot_name=robot,
@@ -195,6 +199,7 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
             endpoint=endpoint,
             agent_options=("--lifetime-ms", str(lifetime_ms)),
             coordinator_options=("--plan", str(plan), "--no-dynamics", "--no-report"),
+            hebi=hebi or THROUGH_THE_DRIVER,
         )
         made.append(Launcher(config, lambda text: None))
         return made[-1]

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from module_agent import main as agent_program
+from module_agent.hardware import hebi_network
 from module_agent.hardware.hardware import HardwareLost
 from module_agent.main import app
 from module_agent.model.errors import EXIT_LOST, UsageError
@@ -20,6 +22,10 @@ from module_agent.network_emulation.impaired_transport import ImpairedTransport,
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile, PathProfile
 from module_agent.transport.endpoint import check_endpoint
 from module_agent.worker import ThreadWorker
+from sim.hebi_stand_in import on_bus
+from sim.robot.robot_file import load_robot
+from sim.world.bus_server import BusServer
+from sim.world.world import World
 
 
 @pytest.mark.parametrize(
@@ -42,6 +48,51 @@ def test_wrong_usage_is_answered_at_once_with_what_is_right(arguments: tuple[str
     done = CliRunner().invoke(app, ["--serial", "A-1", "--bus", "no-bus", *arguments])
     assert done.exit_code == 2, done.output
     assert message in done.output
+
+
+STAND_IN = ("--hebi", "--library", "sim.hebi_stand_in.on_bus")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "give --serial and --bus for simulated modules, or --hebi for real ones"),
+        ((*STAND_IN, "--expiry", "damping"), "it must be motor_off or hold with --hebi"),
+        (STAND_IN, "the environment has no X5_STAND_IN_BUS and no X5_STAND_IN_SERIALS"),
+        ((*STAND_IN, "--list"), "the environment has no X5_STAND_IN_BUS"),
+        (("--hebi", "--library", "no_such_library"), "pip install --no-deps hebi-py==2"),
+    ],
+)
+def test_real_modules_that_cannot_be_run_are_refused_at_once(
+    arguments: tuple[str, ...], message: str
+) -> None:
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 2, done.output
+    assert message in " ".join(done.output.split())
+
+
+def test_modules_on_hebis_network_are_listed_by_family_and_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(load_robot("thesis_171_vertical"), seed=1, noise="ideal")
+    server, ended = BusServer(str(tmp_path / "bus"), world, bound_s=20.0), threading.Event()
+    thread = threading.Thread(target=server.run, args=(None, ended.is_set))
+    thread.start()
+    monkeypatch.setenv(on_bus.BUS, str(tmp_path / "bus"))
+    monkeypatch.setenv(on_bus.SERIALS, "X-00009,X-00010")
+    monkeypatch.setattr(hebi_network, "LOOKUP_S", 0.0)
+    try:
+        done = CliRunner().invoke(app, (*STAND_IN, "--list"))
+    finally:
+        ended.set()
+        thread.join(20.0)
+        world.close()
+    assert done.exit_code == 0, done.output
+    rows = [line.split() for line in done.output.splitlines()]
+    assert rows[0] == ["family", "name", "serial", "type", "firmware", "address"]
+    assert [row[:4] for row in rows[1:]] == [
+        ["simulated", module.serial, module.serial, module.module_type] for module in world.modules
+    ]
 
 
 def test_a_port_that_somebody_else_has_is_named_and_not_waited_for() -> None:

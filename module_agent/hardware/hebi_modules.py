@@ -1,0 +1,320 @@
+"""Real HEBI modules behind the contract of `Modules`, through hebi-py.
+
+The loops run in the modules, which keep a command for HEBI's command lifetime: an agent that dies lets its
+modules expire by themselves. The driver paces itself: a tick is a feedback request, its answer and a command.
+What the modules send is checked as every sample is.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.control.controller import NOMINAL_VOLTAGE_V, Command
+from module_agent.hardware.hardware import (
+    HardwareLost,
+    LimitState,
+    ModuleInformation,
+    ModuleSample,
+    SensorSample,
+)
+from module_agent.hardware.hebi_library import Group, Library
+from module_agent.hardware.sample_check import MAX_HELD, SampleCheck
+from module_agent.model.catalogue import module_type
+from module_agent.wire.messages import GainSet, PidGains
+
+# A round trip takes 0.7 ms, 1.6 at most (measured on a real X5-1).
+FEEDBACK_TIMEOUT_MS = 20
+LOST_AFTER_S = 1.0
+_CONFIRM_MS, _CONFIRM_TRIES = 50, 3
+_OFF_LED, _ON_LED = (0, 0, 0, 0), (255, 0, 255, 255)
+
+# HEBI's name of every reading of a sample from the position on, but for the two vectors.
+FIELDS = {
+    "position_rad": "position",
+    "velocity_rad_s": "velocity",
+    "effort_nm": "effort",
+    "deflection_rad": "deflection",
+    "motor_velocity_rad_s": "motor_velocity",
+    "motor_current_a": "motor_winding_current",
+    "winding_temperature_c": "motor_winding_temperature",
+    "voltage_v": "voltage",
+    "deflection_velocity_rad_s": "deflection_velocity",
+}
+_COLUMNS = [(SensorSample._fields.index(ours), hebi) for ours, hebi in FIELDS.items()]
+_GYRO = SensorSample._fields.index("gyro_x_rad_s")
+_ACCEL = SensorSample._fields.index("accel_x_m_s2")
+_IMU = slice(_GYRO, _ACCEL + 3)
+_VOLTAGE = SensorSample._fields.index("voltage_v")
+
+# HEBI's values of the states of a module.
+_M_STOP_PRESSED = 0
+_INSIDE = 2
+_TEMPERATURES = {1: LimitState.TEMPERATURE, 2: LimitState.OVER_TEMPERATURE, 3: LimitState.OVER_TEMPERATURE}
+_LIMIT_FIELDS = {
+    "position_limit_state": LimitState.POSITION,
+    "velocity_limit_state": LimitState.VELOCITY,
+    "effort_limit_state": LimitState.EFFORT,
+}
+_LOCKED_BY_OTHER = 1
+HELD_BY_OTHER = "another program commands this module (command_lifetime_state: LockedByOther): end it first"
+
+
+class HebiModules:
+    """`Modules` over a HEBI group.
+
+    While all motors are off for longer than a lifetime nothing is sent, so that other programs can command
+    the modules.
+
+    Args:
+        library: hebi-py, or what stands in for it.
+        group: the modules; its own feedback thread is turned off.
+        information: of the modules, see `hebi_network.describe`.
+        wait: returns when the next tick is due.
+        stamp: a clock [ns] in place of the modules', for a group whose feedback has no times.
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        group: Group,
+        information: Sequence[ModuleInformation],
+        wait: Callable[[], None],
+        stamp: Callable[[], int] | None = None,
+    ):
+        self._library, self._group = library, group
+        self._information = list(information)
+        self._wait, self._stamp = wait, stamp
+        self._links = [_Link(one) for one in information]
+        count = len(self._links)
+        self._feedback = library.GroupFeedback(count)
+        self._command = library.GroupCommand(count)
+        self._targets = np.full((count, 3), math.nan)
+        self._lifetimes_ns = [250_000_000] * count
+        self._readings = np.full((count, len(SensorSample._fields)), math.nan)
+        self._ticks = self._missed = self._off_ticks = self._unsent = 0
+        self._closed = False
+        group.feedback_frequency = 0.0
+        self._apply_lifetime()
+
+    @property
+    def information(self) -> Sequence[ModuleInformation]:
+        """The modules, in the order of the group, with the gains in force."""
+        return tuple(self._information)
+
+    def receive(self) -> list[ModuleSample]:
+        """Wait until the next tick is due, ask the modules for their feedback, return one sample per module.
+
+        A module that does not answer keeps its last sample, whose time goes on slowly; a few times in a row
+        are a fault.
+
+        Raises:
+            HardwareLost: no module has answered for `LOST_AFTER_S`, or this is closed.
+        """
+        if self._closed:
+            raise HardwareLost("the modules are released")
+        self._wait()
+        self._ticks += 1
+        self._group.send_feedback_request()
+        answer = self._group.get_next_feedback(timeout_ms=FEEDBACK_TIMEOUT_MS, reuse_fbk=self._feedback)
+        if answer is None:
+            self._missed += 1
+            if self._missed * FEEDBACK_TIMEOUT_MS >= 1e3 * LOST_AFTER_S:
+                raise HardwareLost(f"none of {self._names} has answered for {LOST_AFTER_S:g} s")
+            return [link.without_feedback() for link in self._links]
+        self._missed = 0
+        return self._samples(answer)
+
+    def send(self, commands: Sequence[Command]) -> list[float]:
+        """Send one command per module; return the PWM of the last feedback.
+
+        Raises:
+            ValueError: not one command per module, or there was no sample yet.
+            HardwareLost: commands cannot be sent for `LOST_AFTER_S`.
+        """
+        if len(commands) != len(self._links) or not self._ticks:
+            raise ValueError(
+                f"{len(commands)} commands for {len(self._links)} modules, {self._ticks} ticks have been "
+                "read: receive a sample first, then send one command per module"
+            )
+        self._targets[:] = [command[:3] for command in commands]
+        commanded = np.isfinite(self._targets).any(axis=1)
+        for index in np.flatnonzero(commanded).tolist():
+            self._end_m_stop(index, commands[index])
+        active = bool(commanded.any())
+        self._off_ticks = 0 if active else self._off_ticks + 1
+        # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
+        if active or self._off_ticks * self._information[0].tick_ns <= min(self._lifetimes_ns):
+            self._send_targets()
+        return [link.pwm for link in self._links]
+
+    def set_gains(self, index: int, gains: GainSet) -> None:
+        """Replace the gains of a module until its next power cycle.
+
+        Raises:
+            HardwareLost: the module does not confirm them.
+        """
+        command = self._settings()
+        write_gains(command[index], gains)
+        self._confirmed(command, f"the gains of {self._links[index].serial}")
+        self._information[index] = self._information[index]._replace(gains=gains)
+
+    def set_lifetime(self, index: int, lifetime_ns: int) -> None:
+        """Set HEBI's command lifetime, in whole milliseconds; a group has one, the shortest of its modules.
+
+        Raises:
+            ValueError: a lifetime that is not positive.
+        """
+        if lifetime_ns <= 0:
+            raise ValueError(f"lifetime {lifetime_ns / 1e6:g} ms: it must be over 0")
+        self._lifetimes_ns[index] = lifetime_ns
+        self._apply_lifetime()
+
+    def identify(self, index: int, on: bool) -> None:
+        """Light a module's LED, or give it back to the module."""
+        command = self._settings()
+        command[index].led.color = self._library.Color(*(_ON_LED if on else _OFF_LED))
+        self._group.send_command(command)
+
+    def close(self) -> None:
+        """Send a last command without targets. May be called twice."""
+        if self._closed:
+            return
+        self._closed = True
+        self._targets[:] = math.nan
+        for _ in range(_CONFIRM_TRIES):
+            if self._group.send_command_with_acknowledgement(self._settings(), timeout_ms=_CONFIRM_MS):
+                return
+
+    @property
+    def _names(self) -> str:
+        return ", ".join(link.serial for link in self._links)
+
+    def _samples(self, answer: Any) -> list[ModuleSample]:
+        readings = self._readings
+        for column, name in _COLUMNS:
+            readings[:, column] = getattr(answer, name)
+        readings[:, _GYRO : _GYRO + 3] = answer.gyro
+        readings[:, _ACCEL : _ACCEL + 3] = answer.accelerometer
+        pwm = np.nan_to_num(answer.pwm_command * readings[:, _VOLTAGE] / NOMINAL_VOLTAGE_V)
+        times_us = answer.hardware_transmit_time_us.tolist()
+        limits = _limits(answer)
+        pressed = (answer.mstop_state == _M_STOP_PRESSED).tolist()
+        locked = (answer.command_lifetime_state == _LOCKED_BY_OTHER).tolist()
+        stamped_ns = None if self._stamp is None else self._stamp()
+        samples = []
+        for index, (link, row) in enumerate(zip(self._links, readings.tolist(), strict=True)):
+            t_ns = 1000 * int(times_us[index]) if stamped_ns is None else stamped_ns
+            if t_ns == 0 or t_ns == link.feedback_ns:
+                samples.append(link.without_feedback())
+                continue
+            link.pwm = min(max(float(pwm[index]), -1.0), 1.0)
+            link.limits, link.m_stop = limits[index], pressed[index]
+            link.is_off_after_m_stop |= pressed[index]
+            fault = HELD_BY_OTHER if locked[index] else ""
+            samples.append(link.with_feedback(t_ns, row, self._ticks, fault))
+        return samples
+
+    def _end_m_stop(self, index: int, command: Command) -> None:
+        """Give a module that follows commands again the strategy back: its M-stop has left 0 behind."""
+        link = self._links[index]
+        if link.is_off_after_m_stop and not link.m_stop and not command.brake:
+            link.is_off_after_m_stop = False
+            self.set_gains(index, self._information[index].gains)
+
+    def _send_targets(self) -> None:
+        self._write_targets(self._command)
+        self._unsent = 0 if self._group.send_command(self._command) else self._unsent + 1
+        if self._unsent * self._information[0].tick_ns > 1e9 * LOST_AFTER_S:
+            raise HardwareLost(f"commands to {self._names} cannot be sent for {LOST_AFTER_S:g} s")
+
+    def _write_targets(self, command: Any) -> None:
+        # A NaN is sent as a target that is not set.
+        command.position, command.velocity, command.effort = self._targets.T
+
+    def _settings(self) -> Any:
+        """Return a command with the targets of the last one, to which settings are added.
+
+        Targets that are left out would switch the loops off.
+        """
+        command = self._library.GroupCommand(len(self._links))
+        self._write_targets(command)
+        return command
+
+    def _confirmed(self, command: Any, what: str) -> None:
+        for _ in range(_CONFIRM_TRIES):
+            if self._group.send_command_with_acknowledgement(command, timeout_ms=_CONFIRM_MS):
+                return
+        raise HardwareLost(f"{what} are not confirmed in {_CONFIRM_TRIES} tries of {_CONFIRM_MS} ms")
+
+    def _apply_lifetime(self) -> None:
+        # For HEBI, 0 is for ever.
+        self._group.command_lifetime = max(1, min(self._lifetimes_ns) // 1_000_000)
+
+
+class _Link:
+    """What the driver remembers of one module: its last sample, and what it last told of its drive."""
+
+    def __init__(self, information: ModuleInformation):
+        self.serial = information.serial
+        self.feedback_ns = 0
+        self.pwm = 0.0
+        self.limits = LimitState.NONE
+        self.m_stop = False
+        self.is_off_after_m_stop = False
+        self._tick_ns = information.tick_ns
+        self._check = SampleCheck(module_type(information.module_type))
+        self._sequence = 0
+        self._misses = 0
+        self._imu: list[float] = []
+        self._last = self._check.checked(_sensors(0, 0, [math.nan] * len(SensorSample._fields)))
+        self._fault = ""
+
+    def with_feedback(self, t_ns: int, row: list[float], tick: int, fault: str) -> ModuleSample:
+        """Return the sample of a feedback; `row` is in the order of a sample."""
+        # Feedback does not say when the IMU was read: no later than when its values were first seen.
+        fresh, self._imu = row[_IMU] != self._imu, row[_IMU]
+        imu_t_ns = t_ns if fresh else min(self._last.imu_t_ns, t_ns)
+        self.feedback_ns, self._sequence, self._misses = t_ns, tick, 0
+        self._last = self._check.checked(_sensors(t_ns, imu_t_ns, row))
+        self._fault = self._check.fault or fault
+        return self._sample(self._fault)
+
+    def without_feedback(self) -> ModuleSample:
+        """Return the sample of a tick without feedback: the last one, later by half a tick.
+
+        A module's clock has moved on by a whole one, so its next time is later in any case.
+        """
+        self._misses += 1
+        self._last = self._last._replace(t_ns=self._last.t_ns + self._tick_ns // 2)
+        return self._sample(
+            f"no feedback in {self._misses} ticks" if self._misses > MAX_HELD else self._fault
+        )
+
+    def _sample(self, fault: str) -> ModuleSample:
+        return ModuleSample(self._last, self.pwm, self._sequence, self.limits, self.m_stop, fault)
+
+
+def _sensors(t_ns: int, imu_t_ns: int, row: list[float]) -> SensorSample:
+    return SensorSample(t_ns, imu_t_ns, *row[2:])
+
+
+def _limits(answer: Any) -> list[LimitState]:
+    """Return what acts on each module, by its four states."""
+    states = [_TEMPERATURES.get(state, LimitState.NONE) for state in answer.temperature_state.tolist()]
+    for name, flag in _LIMIT_FIELDS.items():
+        outside: NDArray[np.bool_] = getattr(answer, name) != _INSIDE
+        for index in np.flatnonzero(outside):
+            states[index] |= flag
+    return states
+
+
+def write_gains(command: Any, gains: GainSet) -> None:
+    """Write gains into one module's part of a command."""
+    command.control_strategy = gains.strategy
+    for loop in ("position", "velocity", "effort"):
+        own: PidGains = getattr(gains, loop)
+        for name in PidGains.model_fields:
+            setattr(command, f"{loop}_{name}", getattr(own, name))

@@ -1,0 +1,229 @@
+"""HEBI modules on the network: finding them, and what they tell of themselves."""
+
+import math
+import re
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.hardware.hardware import HardwareLost, ModuleInformation
+from module_agent.hardware.hebi_library import HEBI, Group, Library, library, names_of
+from module_agent.hardware.hebi_modules import HebiModules
+from module_agent.model.catalogue import CATALOGUE, ModuleType, module_type
+from module_agent.model.errors import UsageError
+from module_agent.wire.keys import check_chunk
+from module_agent.wire.messages import GainSet, Limits, PidGains
+
+# Modules answer the lookup within a second; HEBI's examples wait for two.
+LOOKUP_S = 2.0
+MIN_RATE_HZ, MAX_RATE_HZ = 50.0, 1000.0
+_TIMEOUT_MS = 1000
+_LIMIT_DISABLED = 3
+_MAX_GAIN = 1e6
+
+
+class HebiOptions(NamedTuple):
+    """Which modules to drive and how: those of a family by their names, or all of them without.
+
+    types: of the modules in their order, if they are not to be asked. `library` stands in for hebi-py.
+    """
+
+    family: str
+    names: tuple[str, ...] = ()
+    types: tuple[str, ...] = ()
+    rate_hz: float = 250.0
+    library: str = HEBI
+
+
+def open_modules(options: HebiOptions) -> HebiModules:
+    """Find modules on the network and return their driver, in real time.
+
+    Raises:
+        UsageError: hebi-py or a module is missing, or an option cannot be.
+        HardwareLost: a module does not answer.
+    """
+    hebi = library(options.library)
+    group = find_group(hebi, options.family, options.names)
+    information = describe(hebi, group, options.rate_hz, options.types)
+    return HebiModules(hebi, group, information, Pace(options.rate_hz).wait)
+
+
+class Seen(NamedTuple):
+    """A module on the network; serial, type and firmware are empty if it does not tell them."""
+
+    family: str
+    name: str
+    address: str
+    serial: str
+    mechanical_type: str
+    firmware: str
+
+
+def seen(hebi: Library, sleep: Callable[[float], None] = time.sleep) -> list[Seen]:
+    """Return the modules that answer a lookup, by family and name."""
+    lookup = hebi.Lookup()
+    sleep(LOOKUP_S)
+    entries = [entry for entry in lookup.entrylist if entry is not None]
+    found = []
+    for entry in sorted(entries, key=lambda e: (e.family, e.name)):
+        group = lookup.get_group_from_names([entry.family], [entry.name], _TIMEOUT_MS)
+        info = None if group is None else group.request_info(timeout_ms=_TIMEOUT_MS)
+        told = [""] * 3
+        if info is not None:
+            told = names_of([info.serial[0], info.mechanical_type[0], info.firmware_revision[0]])
+        found.append(Seen(entry.family, entry.name, str(entry.ip_address), *told))
+    return found
+
+
+def find_group(
+    hebi: Library, family: str, names: Sequence[str], sleep: Callable[[float], None] = time.sleep
+) -> Group:
+    """Return the modules of a family by their names, or all of them without names.
+
+    Raises:
+        UsageError: one is missing; the message has those that are there.
+    """
+    lookup = hebi.Lookup()
+    sleep(LOOKUP_S)
+    if names:
+        group = lookup.get_group_from_names([family], list(names), _TIMEOUT_MS)
+    else:
+        group = lookup.get_group_from_family(family, _TIMEOUT_MS)
+    if group is None:
+        there = sorted(f"{e.family}/{e.name}" for e in lookup.entrylist if e is not None)
+        wanted = ", ".join(f"{family}/{name}" for name in names) or f"any module of family {family}"
+        raise UsageError(
+            f"{wanted}: not all are on the network, which has {', '.join(there) or 'none'} "
+            "(see x5-agent --hebi --list)"
+        )
+    return group
+
+
+def describe(
+    hebi: Library, group: Group, rate_hz: float, types: Sequence[str] = ()
+) -> list[ModuleInformation]:
+    """Return what the modules of a group tell of themselves.
+
+    Accelerometers are made to read specific force: the setting is not saved in the module.
+
+    Args:
+        hebi: hebi-py.
+        group: the modules.
+        rate_hz: ticks a second.
+        types: of the modules in their order, if they are not to be asked.
+
+    Raises:
+        HardwareLost: they do not answer, or an accelerometer cannot be made to read gravity.
+        UsageError: a rate, a number of types, a type or a serial that cannot be.
+    """
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise UsageError(f"--rate {rate_hz:g}: it must be {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz")
+    if types and len(types) != group.size:
+        raise UsageError(f"{len(types)} types for {group.size} modules: give one for each, or none")
+    info = _info(group)
+    if not info.accel_includes_gravity.all():
+        info = _with_gravity(hebi, group)
+    return [_described(info, index, rate_hz, types) for index in range(group.size)]
+
+
+def _info(group: Group) -> Any:
+    info = group.request_info(timeout_ms=_TIMEOUT_MS)
+    if info is None:
+        raise HardwareLost(f"a module does not tell its settings within {_TIMEOUT_MS} ms")
+    return info
+
+
+def _with_gravity(hebi: Library, group: Group) -> Any:
+    command = hebi.GroupCommand(group.size)
+    command.accel_includes_gravity = [True] * group.size
+    group.send_command_with_acknowledgement(command, timeout_ms=_TIMEOUT_MS)
+    info = _info(group)
+    wrong = [name for name, on in zip(info.serial, info.accel_includes_gravity, strict=True) if not on]
+    if wrong:
+        raise HardwareLost(
+            f"the accelerometer of {', '.join(names_of(wrong))} leaves out gravity (accel_includes_gravity) "
+            "and does not take the setting: every estimate needs specific force; set it in HEBI's Scope"
+        )
+    return info
+
+
+def _described(info: Any, index: int, rate_hz: float, types: Sequence[str]) -> ModuleInformation:
+    name, family, serial = (names_of(values)[index] for values in (info.name, info.family, info.serial))
+    check_chunk("serial", serial)
+    told = types[index] if types else names_of(info.mechanical_type)[index]
+    kind = module_type(_type_name(told, serial))
+    tick_ns = round(1e9 / rate_hz)
+    gains, limits = _gains(info, index, kind), _limits(info, index, kind)
+    return ModuleInformation(serial, name, family, kind.name, gains, limits, tick_ns, tick_ns)
+
+
+def _type_name(told: str, serial: str) -> str:
+    """Return the catalogue's name of what a module says that it is, such as "X5-4" or "Actuator X5-4 B"."""
+    # "X5-9-old" is no X5-9.
+    for name in sorted(CATALOGUE, key=len, reverse=True):
+        if re.search(rf"(?<![\w-]){re.escape(name)}(?!\d)", told):
+            return name
+    raise UsageError(
+        f"module {serial} is of type {told!r}; the catalogue knows {', '.join(CATALOGUE)}: give --type for "
+        "every module, or add its type to module_types.toml"
+    )
+
+
+def _limits(info: Any, index: int, kind: ModuleType) -> Limits:
+    """Return the type's limits, or the module's own where they are narrower."""
+    limits = catalogue_limits(kind)
+    low, high = float(info.position_limit_min[index]), float(info.position_limit_max[index])
+    position = {}
+    if low < high:
+        if info.min_position_limit_strategy[index] != _LIMIT_DISABLED and math.isfinite(low):
+            position["min_position_rad"] = low
+        if info.max_position_limit_strategy[index] != _LIMIT_DISABLED and math.isfinite(high):
+            position["max_position_rad"] = high
+    most = {}
+    for field, name in (("max_speed_rad_s", "velocity"), ("max_effort_nm", "effort")):
+        own = (abs(float(getattr(info, f"{name}_limit_{side}")[index])) for side in ("min", "max"))
+        most[field] = min([getattr(limits, field), *(value for value in own if value > 0.0)])
+    return limits.model_copy(update=position | most)
+
+
+def _gains(info: Any, index: int, kind: ModuleType) -> GainSet:
+    """Return the gains in force; the factory's where a module does not tell one."""
+    strategy = int(info.control_strategy[index])
+    factory = default_gains(kind, strategy if 0 <= strategy <= 4 else 0)
+    loops = {}
+    for loop in ("position", "velocity", "effort"):
+        values = {name: float(getattr(info, f"{loop}_{name}")[index]) for name in PidGains.model_fields}
+        # HEBI's infinite limits are a million here.
+        known = {k: min(max(v, -_MAX_GAIN), _MAX_GAIN) for k, v in values.items() if not math.isnan(v)}
+        known["d_on_error"] = bool(values["d_on_error"])
+        try:
+            loops[loop] = PidGains.model_validate(getattr(factory, loop).model_dump() | known)
+        except ValidationError:
+            loops[loop] = getattr(factory, loop)
+    return GainSet(strategy=factory.strategy, **loops)
+
+
+class Pace:
+    """Returns from `wait` at even times; a tick that comes late is not made up for."""
+
+    def __init__(
+        self,
+        rate_hz: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self._period_s = 1.0 / rate_hz
+        self._clock, self._sleep = clock, sleep
+        self._due_s = clock()
+
+    def wait(self) -> None:
+        """Sleep until the next tick is due."""
+        now_s = self._clock()
+        if now_s < self._due_s:
+            self._sleep(self._due_s - now_s)
+            self._due_s += self._period_s
+        else:
+            self._due_s = max(self._due_s, now_s - self._period_s) + self._period_s

@@ -1,0 +1,1 @@
+"""What stands in for hebi-py without modules: the part that the driver uses, over simulated modules."""

@@ -1,0 +1,186 @@
+"""Simulated modules on HEBI's network: they tick by themselves and keep their last command alive."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from module_agent.control.controller import MOTOR_OFF, NOMINAL_VOLTAGE_V, Command
+from module_agent.control.gains import default_gains
+from module_agent.hardware.hardware import (
+    LimitState,
+    ModuleSample,
+    Readings,
+    SensorSample,
+    WiredModule,
+)
+from module_agent.hardware.hebi_modules import FIELDS
+from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.catalogue import AMBIENT_C, GRAVITY_M_S2, module_type
+from module_agent.wire.messages import GainSet, PidGains
+from sim.hebi_stand_in.messages import LOOPS, Color, GroupCommand, GroupFeedback, GroupInfo
+
+FAMILY = "simulated"
+UNLOCKED, LOCKED_BY_OTHER, LOCKED_BY_SENDER = 0, 1, 2
+_INSIDE, _AT_UPPER = 2, 3
+_LIMIT_DISABLED = 3
+_NO_LIMIT_TOLD = math.nan
+# Readings before the first tick: at rest, with z up.
+_NOTHING = SensorSample(0, 0, 0, 0, 0, 0, 0, 0, AMBIENT_C, 24.0, 0, 0, 0, 0, 0, GRAVITY_M_S2)
+
+
+class _Wires:
+    """The wires inside one module; the tick has passed already when its loops ask for it."""
+
+    def __init__(self, module: WiredModule):
+        self.modules: Sequence[WiredModule] = (module,)
+        self.reading = _NOTHING
+
+    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        return (self.reading,)
+
+    def close(self) -> None:
+        """Do nothing: the wires are inside."""
+
+
+class NetworkModule:
+    """One simulated module with its settings, and the sender that commands it.
+
+    m_stop: its emergency stop is pressed. silent: it hears and says nothing, as with its cable pulled out.
+    """
+
+    def __init__(self, module: WiredModule):
+        self._wires = _Wires(module)
+        self._loops = LoopInside(self._wires)
+        self._kind = module_type(module.module_type)
+        self.serial = self.name = module.serial
+        self.family = FAMILY
+        self.type = module.module_type
+        self.accel_includes_gravity = True
+        self.m_stop = self.silent = False
+        self.led: Color | None = None
+        self.sample = self._loops.take(0, _NOTHING)
+        self._targets: Command | None = None
+        self._sender: object = None
+        self._until_ns: float = 0
+
+    @property
+    def gains(self) -> GainSet:
+        """The gains in force."""
+        return self._loops.information[0].gains
+
+    def tick(self, reading: SensorSample) -> float:
+        """Run the loops on what is read; return the PWM."""
+        self._wires.reading = reading
+        (self.sample,) = self._loops.receive()
+        if self.m_stop:
+            # HEBI's MotorOff: strategy 0 until the user sets another one.
+            if self.gains.strategy:
+                self._loops.set_gains(0, default_gains(self._kind, 0))
+            self._targets = MOTOR_OFF
+        if self.sample.sensors.t_ns > self._until_ns and self._sender is not None:
+            self._sender, self._targets = None, MOTOR_OFF
+        if self._targets is not None:
+            # A command lives on by HEBI's lifetime, not by that of the loops.
+            self._loops.send([self._targets])
+        return self._loops.pwm[0]
+
+    def command(self, sender: object, lifetime_ms: int, command: GroupCommand, index: int) -> bool:
+        """Take one module's part of a command; return whether the module heard it."""
+        if self.silent:
+            return False
+        now_ns = self.sample.sensors.t_ns
+        if self._sender not in (None, sender):
+            return True
+        self._sender = sender
+        self._until_ns = now_ns + 1e6 * lifetime_ms if lifetime_ms else math.inf
+        position, velocity, effort = (float(getattr(command, name)[index]) for name in LOOPS)
+        self._targets = Command(position, velocity, effort)
+        self._settings(command, index)
+        return True
+
+    def _settings(self, command: GroupCommand, index: int) -> None:
+        written = {each[0] for each in command.written if isinstance(each, tuple) and each[1] == index}
+        if "control_strategy" in written:
+            own = self.gains.model_dump()
+            for loop in LOOPS:
+                names = [name for name in PidGains.model_fields if f"{loop}_{name}" in written]
+                own[loop] |= {name: getattr(command, f"{loop}_{name}")[index].item() for name in names}
+            own["strategy"] = int(command.control_strategy[index])
+            self._loops.set_gains(0, GainSet.model_validate(own))
+        if "accel_includes_gravity" in command.written:
+            self.accel_includes_gravity = bool(command.accel_includes_gravity[index])
+        if (color := command.leds[index].color) is not None:
+            self.led = color if color.a else None
+
+    def write_feedback(self, sender: object, feedback: GroupFeedback, index: int) -> None:
+        """Write this module's part of a feedback for a sender."""
+        sensors = self.sample.sensors
+        for ours, name in FIELDS.items():
+            getattr(feedback, name)[index] = getattr(sensors, ours)
+        feedback.gyro[index] = sensors.gyro_x_rad_s, sensors.gyro_y_rad_s, sensors.gyro_z_rad_s
+        feedback.accelerometer[index] = sensors.accel_x_m_s2, sensors.accel_y_m_s2, sensors.accel_z_m_s2
+        if not self.accel_includes_gravity:
+            feedback.accelerometer[index, 2] -= GRAVITY_M_S2
+        feedback.pwm_command[index] = self.sample.pwm * NOMINAL_VOLTAGE_V / sensors.voltage_v
+        feedback.hardware_transmit_time_us[index] = sensors.t_ns // 1000
+        feedback.mstop_state[index] = not self.m_stop
+        locked = UNLOCKED if self._sender is None else LOCKED_BY_OTHER
+        feedback.command_lifetime_state[index] = LOCKED_BY_SENDER if self._sender is sender else locked
+        self._write_limits(self.sample, feedback, index)
+
+    def _write_limits(self, sample: ModuleSample, feedback: GroupFeedback, index: int) -> None:
+        acting = sample.limits
+        feedback.temperature_state[index] = (
+            2 if LimitState.OVER_TEMPERATURE in acting else int(LimitState.TEMPERATURE in acting)
+        )
+        for name in LOOPS:
+            flag = LimitState[name.upper()]
+            getattr(feedback, f"{name}_limit_state")[index] = _AT_UPPER if flag in acting else _INSIDE
+
+    def write_info(self, info: GroupInfo, index: int) -> None:
+        """Write what this module tells of itself."""
+        info.name[index], info.family[index], info.serial[index] = self.name, self.family, self.serial
+        info.mechanical_type[index], info.firmware_revision[index] = self.type, "stand-in"
+        info.accel_includes_gravity[index] = self.accel_includes_gravity
+        info.control_strategy[index] = self.gains.strategy
+        for loop in LOOPS:
+            own: PidGains = getattr(self.gains, loop)
+            for name in PidGains.model_fields:
+                getattr(info, f"{loop}_{name}")[index] = getattr(own, name)
+        limits = self._loops.information[0].limits
+        for side, value in (("min", limits.min_position_rad), ("max", limits.max_position_rad)):
+            getattr(info, f"position_limit_{side}")[index] = _NO_LIMIT_TOLD if value is None else value
+            getattr(info, f"{side}_position_limit_strategy")[index] = _LIMIT_DISABLED if value is None else 0
+
+
+class ModuleNetwork:
+    """All simulated modules of a network; `tick` is called once a millisecond of theirs."""
+
+    def __init__(self, modules: Sequence[WiredModule]):
+        self.all = [NetworkModule(module) for module in modules]
+
+    def tick(self, readings: Readings) -> list[float]:
+        """Run the loops of all modules; return the PWM of each."""
+        return [module.tick(reading) for module, reading in zip(self.all, readings, strict=True)]
+
+    def named(self, family: str, names: Sequence[str] | None = None) -> list[NetworkModule] | None:
+        """Return the modules of a family, in the order of `names` if given; None if one is missing."""
+        family_of = {module.name: module for module in self.all if module.family == family}
+        if names is None:
+            return list(family_of.values()) or None
+        return [family_of[name] for name in names] if set(names) <= set(family_of) else None
+
+
+def entry_of(module: NetworkModule) -> Any:
+    """Return a module's entry in a lookup."""
+    return Entry(module.name, module.family)
+
+
+class Entry:
+    """A module that a lookup has seen; simulated ones have no address of their own."""
+
+    mac_address = "00:00:00:00:00:00"
+    ip_address = "127.0.0.1"
+
+    def __init__(self, name: str, family: str):
+        self.name, self.family = name, family

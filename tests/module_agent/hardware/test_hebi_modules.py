@@ -1,0 +1,374 @@
+"""The driver of real modules: what it makes of modules that are silent, stopped, or held by someone else."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
+from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.hardware import hebi_library, hebi_network
+from module_agent.hardware.hardware import (
+    HardwareLost,
+    LimitState,
+    ModuleInformation,
+    ModuleSample,
+    SensorSample,
+)
+from module_agent.hardware.hebi_modules import FEEDBACK_TIMEOUT_MS, HELD_BY_OTHER, HebiModules
+from module_agent.hardware.sample_check import MAX_HELD
+from module_agent.model.catalogue import module_type
+from module_agent.model.errors import UsageError
+from sim.hebi_stand_in import messages
+from sim.hebi_stand_in.library import Group, StandIn
+from sim.hebi_stand_in.modules import FAMILY, ModuleNetwork
+from sim.robot.robot_file import load_robot
+from sim.world.world import World
+
+NAN = math.nan
+ROBOT = "thesis_171_vertical"
+LAST = 1
+TICKS = 4  # of the modules in one of the driver's: 250 Hz
+FORWARD = Command(5.0, NAN, NAN)
+
+
+class Bench:
+    """Two simulated modules on HEBI's network, and the driver at 250 Hz."""
+
+    def __init__(self) -> None:
+        self.world = World(load_robot(ROBOT), seed=1, noise="ideal")
+        self.network = ModuleNetwork(self.world.modules)
+        self.module = self.network.all[LAST]
+        self.library = StandIn(self.network)
+        self.pwm = [0.0, 0.0]
+        self.pass_ticks(1)
+        self.group = self.library.Lookup().get_group_from_family(FAMILY)
+        self.driver = self.open(self.group)
+
+    def open(self, group: Any, ticks: int = TICKS) -> HebiModules:
+        """Return a driver of the modules, the first or one of another program."""
+        information = hebi_network.describe(self.library, group, 1000.0 / ticks)
+        return HebiModules(self.library, group, information, lambda: self.pass_ticks(ticks) and None)
+
+    def pass_ticks(self, count: int) -> list[float]:
+        """Let time pass; return the last module's PWM in each tick."""
+        pwm = []
+        for _ in range(count):
+            self.pwm = self.network.tick(self.world.exchange(self.pwm))
+            pwm.append(self.pwm[LAST])
+        return pwm
+
+    def tick(self, command: Command = MOTOR_OFF) -> ModuleSample:
+        """Run one tick of the driver; return the last module's sample."""
+        sample = self.driver.receive()[LAST]
+        self.driver.send([MOTOR_OFF, command])
+        return sample
+
+    def ticks(self, count: int, command: Command = MOTOR_OFF) -> list[ModuleSample]:
+        return [self.tick(command) for _ in range(count)]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_times_are_those_of_the_modules_and_the_imu_is_as_old_as_its_values(bench: Bench) -> None:
+    """The driver asks at 1 kHz, the IMU reads at 250 Hz: the first feedback with new values dates them."""
+    bench.driver = bench.open(bench.group, ticks=1)
+    bench.ticks(10, FORWARD)
+    for _ in range(40):
+        sensors = bench.tick(FORWARD).sensors
+        assert (sensors.t_ns, sensors.imu_t_ns) == bench.world.readings[LAST][:2]
+
+
+def test_a_motor_that_no_driver_commands_any_more_is_off_after_hebis_lifetime(bench: Bench) -> None:
+    bench.driver.set_lifetime(0, 100_000_000)
+    bench.driver.set_lifetime(LAST, 60_000_000)
+    bench.ticks(50, FORWARD)
+    pwm = bench.pass_ticks(80)
+    assert min(pwm[:59]) > 0.1
+    assert max(pwm[62:]) == 0.0
+
+
+@pytest.mark.parametrize(("lifetime_ns", "set_ms"), [(250_000_000, 250), (1_500_000, 1), (100_000, 1)])
+def test_no_lifetime_is_for_ever(bench: Bench, lifetime_ns: int, set_ms: int) -> None:
+    """HEBI's modules take 0 for ever: a lifetime of under a millisecond is one."""
+    bench.driver.set_lifetime(LAST, lifetime_ns)
+    assert bench.group.command_lifetime == set_ms
+
+
+def test_while_motors_are_off_another_program_can_have_the_modules(bench: Bench) -> None:
+    bench.ticks(10, FORWARD)
+    other = bench.open(bench.library.Lookup().get_group_from_family(FAMILY))
+    assert other.receive()[LAST].fault == HELD_BY_OTHER
+    bench.ticks(10)
+    # That they are off was repeated for a lifetime; after another one they are free.
+    for _ in range(2 * 250 // 4 + 2):
+        bench.tick()
+    assert other.receive()[LAST].fault == ""
+    other.send([MOTOR_OFF, FORWARD])
+    bench.pass_ticks(2)
+    assert bench.tick().fault == HELD_BY_OTHER
+    assert bench.pwm[LAST] > 0.1
+
+
+def test_a_silent_module_keeps_its_last_sample_then_is_a_fault_and_at_last_lost(bench: Bench) -> None:
+    good = bench.tick()
+    bench.module.silent = True
+    held = bench.ticks(MAX_HELD)
+    assert {sample.fault for sample in held} == {""}
+    assert {sample.sequence for sample in held} == {good.sequence}
+    assert [sample.sensors.position_rad for sample in held] == [good.sensors.position_rad] * MAX_HELD
+    times = [sample.sensors.t_ns for sample in (good, *held)]
+    assert times == sorted(set(times))
+    assert bench.tick().fault == f"no feedback in {MAX_HELD + 1} ticks"
+    bench.module.silent = False
+    back = bench.tick()
+    assert back.fault == ""
+    assert back.sequence == good.sequence + MAX_HELD + 2
+    assert back.sensors.t_ns > times[-1]
+    bench.module.silent = True
+    with pytest.raises(HardwareLost, match="X-00010 has answered for 1 s"):
+        bench.ticks(1000 // FEEDBACK_TIMEOUT_MS + 1)
+
+
+def test_readings_that_are_not_set_are_held_over_and_then_named(bench: Bench) -> None:
+    good = bench.tick()
+    write = bench.module.write_feedback
+
+    def without(sender: object, feedback: Any, index: int) -> None:
+        write(sender, feedback, index)
+        feedback.effort[index] = NAN
+
+    bench.module.write_feedback = without  # type: ignore[method-assign]
+    samples = bench.ticks(MAX_HELD + 1)
+    assert all(sample.sensors.effort_nm == good.sensors.effort_nm for sample in samples)
+    assert samples[0].fault == ""
+    assert samples[-1].fault.startswith("effort_nm reads nan")
+
+
+def test_the_m_stop_is_reported_and_its_motor_runs_again_when_it_is_commanded_again(bench: Bench) -> None:
+    gains = default_gains(module_type("X5-9"), 4)
+    bench.driver.set_gains(LAST, gains)
+    bench.ticks(5, FORWARD)
+    bench.module.m_stop = True
+    assert bench.ticks(3, FORWARD)[-1].m_stop
+    assert bench.pwm[LAST] == 0.0
+    bench.module.m_stop = False
+    assert not bench.ticks(3)[-1].m_stop
+    # HEBI's M-stop leaves strategy 0 behind, in which not even a brake acts.
+    bench.ticks(3, BRAKE)
+    assert bench.module.gains.strategy == 0
+    bench.ticks(3, FORWARD)
+    assert bench.module.gains.strategy == 4
+    assert bench.pwm[LAST] > 0.1
+
+
+def test_every_gain_arrives_as_it_was_given(bench: Bench) -> None:
+    gains = default_gains(module_type("X5-9"), 2)
+    loop = gains.position.model_copy(
+        update={"ki": 0.5, "kd": 0.25, "punch": 0.125, "dead_zone": 0.0625, "d_on_error": False}
+    )
+    gains = gains.model_copy(update={"position": loop, "effort": loop})
+    bench.driver.set_gains(LAST, gains)
+    assert bench.module.gains.strategy == 2
+    assert bench.module.gains.position == loop
+    assert bench.module.gains.effort == loop
+    assert bench.driver.information[LAST].gains == gains
+    (_, read) = hebi_network.describe(bench.library, bench.group, 250.0)
+    assert read.gains.position == loop
+
+
+def test_the_led_is_lit_and_given_back_while_the_motor_follows_its_command(bench: Bench) -> None:
+    bench.ticks(5, FORWARD)
+    bench.driver.identify(LAST, True)
+    assert bench.module.led is not None
+    bench.driver.identify(LAST, False)
+    assert bench.module.led is None
+    assert min(bench.pass_ticks(4)) > 0.1
+
+
+def test_limits_and_temperatures_are_reported_by_what_acts(bench: Bench) -> None:
+    write = bench.module.write_feedback
+
+    def hot(sender: object, feedback: Any, index: int) -> None:
+        write(sender, feedback, index)
+        feedback.temperature_state[index], feedback.position_limit_state[index] = 3, 4
+
+    bench.module.write_feedback = hot  # type: ignore[method-assign]
+    assert bench.tick().limits == LimitState.OVER_TEMPERATURE | LimitState.POSITION
+
+
+def test_accelerometers_are_made_to_read_gravity(bench: Bench) -> None:
+    bench.module.accel_includes_gravity = False
+    bench.open(bench.group)
+    assert bench.module.accel_includes_gravity
+    assert bench.tick().sensors.accel_x_m_s2 == pytest.approx(bench.world.readings[LAST].accel_x_m_s2)
+
+
+def test_an_accelerometer_that_leaves_out_gravity_for_good_is_refused(bench: Bench) -> None:
+    bench.module._settings = lambda command, index: None  # type: ignore[method-assign]
+    bench.module.accel_includes_gravity = False
+    with pytest.raises(HardwareLost, match=r"of X-00010 leaves out gravity"):
+        bench.open(bench.group)
+
+
+def test_names_types_and_narrower_limits_are_the_modules_own(bench: Bench) -> None:
+    write = bench.module.write_info
+
+    def told(info: Any, index: int) -> None:
+        write(info, index)
+        info.name[index], info.family[index], info.mechanical_type[index] = "elbow", "arm", "X5-4 rev B"
+        info.position_limit_min[index], info.position_limit_max[index] = -0.5, 0.75
+        info.min_position_limit_strategy[index] = 2
+        info.velocity_limit_min[index], info.velocity_limit_max[index] = -0.25, 0.5
+
+    bench.module.write_info = told  # type: ignore[method-assign]
+    (_, own) = hebi_network.describe(bench.library, bench.group, 500.0)
+    assert (own.name, own.family, own.module_type, own.tick_ns) == ("elbow", "arm", "X5-4", 2_000_000)
+    # The upper side's limit is disabled in the module.
+    assert own.limits == catalogue_limits(module_type("X5-4")).model_copy(
+        update={"min_position_rad": -0.5, "max_speed_rad_s": 0.25}
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"rate_hz": 5000.0}, "it must be 50 to 1000 Hz"),
+        ({"types": ["X5-4"]}, "1 types for 2 modules"),
+        ({"types": ["X5-4", "T-1000"]}, "module X-00010 is of type 'T-1000'"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_with_what_is_possible(
+    bench: Bench, change: dict[str, Any], match: str
+) -> None:
+    with pytest.raises(UsageError, match=match):
+        hebi_network.describe(bench.library, bench.group, **{"rate_hz": 250.0} | change)
+
+
+def test_modules_are_found_by_family_and_name_and_what_is_missing_is_named(bench: Bench) -> None:
+    waited: list[float] = []
+    group = hebi_network.find_group(bench.library, FAMILY, ["X-00010"], waited.append)
+    assert group.size == 1
+    assert hebi_network.find_group(bench.library, FAMILY, [], waited.append).size == 2
+    with pytest.raises(
+        UsageError, match=r"simulated/X-1: not all are on the network, which has simulated/X-0"
+    ):
+        hebi_network.find_group(bench.library, FAMILY, ["X-1"], waited.append)
+    with pytest.raises(UsageError, match="any module of family Arm"):
+        hebi_network.find_group(bench.library, "Arm", [], waited.append)
+    assert waited == [hebi_network.LOOKUP_S] * 4
+    described = hebi_network.describe(bench.library, bench.group, 250.0)
+    assert [one.module_type for one in described] == [one.module_type for one in bench.world.modules]
+    rows = hebi_network.seen(bench.library, waited.append)
+    assert [(row.family, row.name, row.mechanical_type) for row in rows] == [
+        (FAMILY, module.serial, module.module_type) for module in bench.world.modules
+    ]
+
+
+def test_ticks_are_even_and_late_ones_are_not_made_up_for() -> None:
+    now = [10.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+
+    pace = hebi_network.Pace(250.0, lambda: now[0], sleep)
+    began = []
+    for number in range(50):
+        pace.wait()
+        began.append(now[0])
+        now[0] += 0.1 if number == 20 else 0.001
+    steps = np.diff(began)
+    assert np.allclose(steps[:20], 0.004)
+    assert steps[20] == pytest.approx(0.1)
+    # One tick late comes at once, then all is even again.
+    assert np.all(steps[21:] < 0.0041)
+    assert np.allclose(steps[23:], 0.004)
+
+
+# ------------------------------------------------------------------ hebi-py itself, where it is installed
+
+
+def hebi() -> Any:
+    try:
+        return hebi_library.library()
+    except UsageError:
+        pytest.skip("hebi-py is not installed")
+
+
+def test_without_hebi_py_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "hebi", None)
+    with pytest.raises(UsageError, match=r"pip install --no-deps hebi-py==2"):
+        hebi_library.library()
+
+
+def test_the_stand_in_has_no_field_and_no_method_that_hebi_py_has_not() -> None:
+    """The names, shapes and number formats of the stand-in are those of hebi-py."""
+    real = hebi()
+    pairs: list[tuple[Any, Any]] = [
+        (messages.GroupCommand(2), real.GroupCommand(2)),
+        (messages.GroupFeedback(2), real.GroupFeedback(2)),
+        (messages.GroupInfo(2), real.GroupInfo(2)),
+    ]
+    for ours, theirs in pairs:
+        for name, array in ours._arrays.items():
+            value = getattr(theirs, name)
+            assert np.shape(value) == np.shape(array), name
+            assert name in messages.TEXTS or np.asarray(value).dtype == array.dtype, name
+    for ours, theirs in ((Group, real.Group), (type(StandIn.Lookup), type(real.Lookup))):
+        assert {n for n in vars(ours) if not n.startswith("_")} <= set(dir(theirs))
+    assert real.Color(1, 2, 3, 4).a == messages.Color(1, 2, 3, 4).a
+
+
+def imitated(hebi: Any, wait: Callable[[], None]) -> HebiModules:
+    information = [
+        ModuleInformation(
+            f"I-{k}",
+            "",
+            "",
+            "X5-4",
+            default_gains(kind := module_type("X5-4"), 3),
+            catalogue_limits(kind),
+            4,
+            4,
+        )
+        for k in range(3)
+    ]
+    group = hebi.util.create_imitation_group(3)
+    return HebiModules(hebi, group, information, wait, time.monotonic_ns)
+
+
+def test_hebis_imitation_group_echoes_what_the_driver_sends() -> None:
+    """It has no dynamics and no times: this is plumbing, field by field, through hebi-py's own messages."""
+    modules = imitated(hebi(), lambda: None)
+    modules.receive()
+    modules.send([Command(1.0, NAN, NAN), Command(NAN, NAN, 0.25), Command(NAN, 0.5, NAN)])
+    modules.identify(1, True)
+    modules.set_gains(2, default_gains(module_type("X5-4"), 4))
+    sensors = [sample.sensors for sample in modules.receive()]
+    assert sensors[0].position_rad == 1.0
+    assert sensors[1].effort_nm == 0.25
+    assert sensors[2].velocity_rad_s == 0.5
+    # What it was not given it does not have; it is held over.
+    assert sensors[0].effort_nm == sensors[1].position_rad == 0.0
+    assert all(math.isfinite(value) for sample in sensors for value in sample)
+    assert sensors[0].t_ns > 0
+    assert len(sensors[0]) == len(SensorSample._fields)
+    modules.close()
+    modules.close()
+    with pytest.raises(HardwareLost):
+        modules.receive()
+
+
+def test_the_driver_paces_a_group_that_does_not() -> None:
+    """Unpaced, the imitation group would run through 50 ticks in a few milliseconds."""
+    modules = imitated(hebi(), hebi_network.Pace(250.0).wait)
+    began = time.monotonic()
+    for _ in range(50):
+        modules.receive()
+    assert time.monotonic() - began > 0.19
