@@ -22,11 +22,31 @@ COMMANDS = {
     "follow": ("follow.follow", "Follow a motion with the identified model; compare input modes."),
 }
 
+EXAMPLES = {
+    "run": "x5-coordinator run --robot my_arm --expect 4 --out runs/my_arm",
+    "replay": "x5-coordinator replay runs/my_arm/session.mcap --out runs/again",
+    "report": "x5-coordinator report runs/my_arm --out my_arm.md",
+    "export": "x5-coordinator export runs/my_arm --to ros2 --rate-hz 100 --out my_arm.mcap",
+    "list": "x5-coordinator list --robot my_arm --expect 4",
+    "stop": "x5-coordinator stop --robot my_arm",
+    "keys": "x5-coordinator keys shoulder elbow --robot my_arm --out keys",
+    "screenshot": "x5-coordinator screenshot runs/my_arm/session.rrd --out my_arm.png",
+    "check": "x5-coordinator check runs/my_arm --out runs/checked",
+    "payload": "x5-coordinator payload runs/my_arm --out runs/loaded",
+    "merge": "x5-coordinator merge runs/monday runs/tuesday --out runs/both",
+    "monitor": "x5-coordinator monitor runs/my_arm --for 600",
+    "excite": "x5-coordinator excite --urdf robot.urdf --out motion.csv",
+    "fit-dynamics": "x5-coordinator fit-dynamics --urdf robot.urdf --data log.csv --json fit.json",
+    "compensate": "x5-coordinator compensate runs/my_arm --for 60",
+    "follow": "x5-coordinator follow runs/my_arm --motion motion.csv",
+}
+
 app = lazy_app(
     "x5-coordinator",
     "Let a modular robot identify its own kinematics and dynamics.",
     "coordinator.commands",
     COMMANDS,
+    EXAMPLES,
 )
 
 if __name__ == "__main__":

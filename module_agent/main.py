@@ -12,6 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
+from typer.core import TyperCommand
 
 from module_agent.control.safety import Safety
 from module_agent.control.safety_file import read_safety
@@ -24,6 +25,8 @@ from module_agent.hardware.hebi_network import HebiOptions, open_modules, seen
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
+from module_agent.model.settings import read_settings, variable
+from module_agent.model.version import installed_version
 from module_agent.network_emulation.impaired_transport import inject
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.profile_file import network as network_named
@@ -37,7 +40,7 @@ from module_agent.worker import ThreadWorker
 if TYPE_CHECKING:
     from module_agent.host import AgentHost
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
 
 CONNECT_ATTEMPT_S = 1.0
 # An agent prints this when it is up; the launcher waits for it.
@@ -90,7 +93,29 @@ def _transport(
                 typer.echo(f"x5-agent: waiting for the network: {error}", err=True)
 
 
-@app.command()
+class AgentCommand(TyperCommand):
+    """The command with its repeated options from `x5.toml` or the environment (see `settings`)."""
+
+    def make_context(self, *arguments: Any, **more: Any) -> Any:
+        """Return the context of a call, with settings as defaults."""
+        try:
+            settings = read_settings(os.environ, Path())
+        except UsageError as error:
+            typer.echo(f"x5-agent: {error}", err=True)
+            raise typer.Exit(EXIT_USAGE) from error
+        for option in self.params:
+            if option.name in ("robot", "connect", "secure"):
+                option.envvar = variable(option.name)
+        return super().make_context(*arguments, default_map=settings, **more)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(installed_version())
+        raise typer.Exit
+
+
+@app.command(cls=AgentCommand, epilog="Example: x5-agent --robot my_arm --bus runs/bus --serial shoulder")
 def main(
     serial: Annotated[
         list[str] | None, typer.Option(help="Serial of a module to run; repeat for several.")
@@ -137,6 +162,9 @@ def main(
         typer.Option(metavar="FILE", help="Limits that the modules enforce, as TOML or HEBI safety XML."),
     ] = None,
     imu: Annotated[ImuKind, typer.Option(help="Calibration of the modules' IMUs.")] = "uncalibrated",
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
 ) -> None:
     """Run the agent of one or several modules until the world ends or a signal comes.
 

@@ -19,11 +19,28 @@ COMMANDS = {
     "compare-log": ("compare_log.compare_log", "Compare a real module's log with the simulated module."),
 }
 
+EXAMPLES = {
+    "run": "x5-sim run a2085_04 --virtual --noise x5 --out runs/a2085_04",
+    "world": "x5-sim world a2085_04 --bus runs/bus --truth runs/by-hand",
+    "fleet": "x5-sim fleet --robots 2 --modules 8 --routers 1 --seconds 10",
+    "robots": "x5-sim robots",
+    "show": "x5-sim show arm6 --out arm6.png",
+    "effects": "x5-sim effects",
+    "score": "x5-sim score runs/a2085_04",
+    "thesis": "x5-sim thesis --quick --only figure19,table2 --out runs/thesis",
+    "monitoring": "x5-sim monitoring --robot a2085_03 --hours 0.1",
+    "faults": "x5-sim faults --seeds 1..20 --workers 2",
+    "compare-log": "x5-sim compare-log log.csv --out comparison",
+}
+
 app = lazy_app(
     "x5-sim",
     "Simulate modular robots, run the whole system on them, and score it.",
     "sim.commands",
     COMMANDS,
+    EXAMPLES,
+    # `robot` names a simulated robot here, not the one on the network.
+    repeated=("listen", "secure", "quiet"),
 )
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import AsJson, ConnectOptions, DynamicsFolder, Speed
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
 from coordinator.commands.views.compensation import CompensationView
 from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.runtime.command_line import fail, with_options
@@ -42,7 +42,7 @@ def compensate_robot(
         bool, typer.Option("--back/--no-back", help="Return to the start position at the end [yes].")
     ] = True,
     speed: Speed = 1.0,
-    as_json: AsJson = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Compensate the robot's weight by its motors, so that it can be led by hand and stays where it is left.
 
@@ -64,7 +64,7 @@ def compensate_robot(
     plan = CompensationPlan(settings, rate, for_s, hold_s, back)
     transport = open_connection(place, Terminal(at.quiet).note).transport
     loop = ScaledLoop(speed)
-    view = CompensationView(model.chain.serials, loop.time, as_json, at.quiet)
+    view = CompensationView(model.chain.serials, loop.time, json_file, at.quiet)
     with view:
         session = CompensationSession(
             transport, place.robot, model, plan, loop.clock_ns, loop.call_soon_threadsafe, view, new_sender()

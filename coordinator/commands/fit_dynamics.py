@@ -14,14 +14,13 @@ from coordinator.arm_fit.fit import STEPS
 from coordinator.arm_fit.payload import KnownPayload
 from coordinator.arm_fit.predictions import write_matrices, write_predictions
 from coordinator.arm_fit.problem import ModelChoice
-from coordinator.arm_fit.report import write_report
-from coordinator.commands.options import Quiet
+from coordinator.commands.options import JsonFile, Quiet
 from coordinator.commands.views.fit_dynamics import notes, page, tables
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
 from coordinator.report.pages import html_page
 from coordinator.report.plots import check_plots
-from coordinator.runtime.terminal import Terminal, print_table
+from coordinator.runtime.terminal import Terminal, print_table, write_result
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
 from module_agent.signals.torque_terms import DRIVE_TERMS, Term
@@ -52,7 +51,6 @@ _Gain = Annotated[
         "was recorded. Repeat for several."
     ),
 ]
-_Json = Annotated[Path | None, typer.Option("--json", help="JSON file to write the report to.")]
 _Html = Annotated[
     Path | None, typer.Option("--html", help="HTML file with the tables and a plot of each joint's torque.")
 ]
@@ -131,7 +129,7 @@ def fit_dynamics(
     data: _Data,
     held_out: _HeldOut = None,
     gain: _Gain = None,
-    json_file: _Json = None,
+    json_file: JsonFile = None,
     html_file: _Html = None,
     predictions: _Predictions = None,
     matrices: _Matrices = None,
@@ -182,10 +180,9 @@ def fit_dynamics(
             )
         for line in notes(fit.report):
             terminal.note(line)
-        for table in tables(fit.report):
-            print_table(table)
-        if json_file is not None:
-            write_report(json_file, fit.report)
+        if write_result(json_file, fit.report):
+            for table in tables(fit.report):
+                print_table(table)
         if html_file is not None:
             write_text(html_file, html_page(page(fit.report, fit.torques)))
         if predictions is not None:

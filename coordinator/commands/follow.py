@@ -1,17 +1,16 @@
 """`x5-coordinator follow`: a robot follows a motion with what was identified of it, in three input modes."""
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import AsJson, ConnectOptions, DynamicsFolder, Speed
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
 from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.runtime.command_line import in_a_folder, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
-from coordinator.runtime.terminal import Terminal, new_table, print_table
+from coordinator.runtime.terminal import Terminal, new_table, print_table, write_result
 from coordinator.torque_control.follow_session import FollowPlan, FollowSession
 from coordinator.torque_control.gravity_model import gravity_model
 from coordinator.torque_control.motion_file import read_motion
@@ -49,7 +48,7 @@ def follow(
         typer.Option(help="JSON file of the result [follow.json in the folder].", callback=in_a_folder),
     ] = None,
     speed: Speed = 1.0,
-    as_json: AsJson = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Follow a motion by position, with velocity, and with the calculated torque; compare the errors.
 
@@ -81,8 +80,7 @@ def follow(
         result = attend(loop, session.run())
     file = result_path(baseline, out)
     write_json(file, result)
-    if as_json:
-        typer.echo(json.dumps(result.model_dump()))
+    if not write_result(json_file, result):
         return
     _print(result)
     typer.echo(f"{file}: tracking of {result.motion}, {result.duration_s:.1f} s, in SI units")

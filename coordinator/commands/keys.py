@@ -18,7 +18,7 @@ def keys(
         list[str] | None,
         typer.Option(metavar="A,B,...", help="Modules that one agent process runs; repeat for several."),
     ] = None,
-    address: Annotated[
+    host: Annotated[
         list[str] | None,
         typer.Option(help="Name or IP address at which the coordinator listens, besides 127.0.0.1; repeat."),
     ] = None,
@@ -30,10 +30,10 @@ def keys(
     authority.key stays where it is safe. `--secure DIR` then takes the folder on every program.
     """
     groups = [[serial.strip() for serial in group.split(",")] for group in together or []]
-    made = make_credentials(out, robot, serials, groups, address or [], days)
+    made = make_credentials(out, robot, serials, groups, host or [], days)
     table = new_table(f"{robot}, keys in {out}", "party | may | files")
-    for host in made.fleet.host:
-        table.add_row(host.name, f"be {', '.join(host.serials)}", f"{host.name}.pem, {host.name}.key")
+    for party in made.fleet.host:
+        table.add_row(party.name, f"be {', '.join(party.serials)}", f"{party.name}.pem, {party.name}.key")
     table.add_row(COORDINATOR, "command; be the hub", f"{COORDINATOR}.pem, {COORDINATOR}.key")
     table.add_row(OBSERVER, "read; stop", f"{OBSERVER}.pem, {OBSERVER}.key")
     table.add_row("everybody", "", f"{FLEET}, {AUTHORITY}.pem")

@@ -1,23 +1,21 @@
 """`x5-coordinator list` and `stop`: the modules on the network, without a lease."""
 
-import json
 from collections.abc import Mapping
 
-import typer
 from rich.table import Table
 
-from coordinator.commands.options import AsJson, ConnectOptions, Expect
+from coordinator.commands.options import ConnectOptions, Expect, JsonFile
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import AS_HUB_S, Listing, Search, listed, stop_robot
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.terminal import Terminal, figure, new_table
+from coordinator.runtime.terminal import Terminal, figure, new_table, write_result
 from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Transport
 
 
 @with_options
-def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = False) -> None:
+def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile = None) -> None:
     """List the modules on the network: state, holder, acting limits, delay of feedback, refused messages.
 
     Exit codes: 0 all answer, 1 a module does not answer or too few do, 2 wrong usage.
@@ -26,11 +24,9 @@ def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = Fa
     transport, search = _open_search(place, at.quiet, expect)
     found = listed(transport, place.robot, search)
     delays = {one.serial: one for one in feedback_delays(found.recording)}
-    if as_json:
-        known = [(status.model_dump(), delays.get(status.serial)) for status in found.statuses]
-        rows = [each | {"feedback_delay": delay and delay._asdict()} for each, delay in known]
-        typer.echo("[" + ",\n ".join(json.dumps(row) for row in rows) + "]")
-    else:
+    known = [(status.model_dump(), delays.get(status.serial)) for status in found.statuses]
+    rows = [each | {"feedback_delay": delay and delay._asdict()} for each, delay in known]
+    if write_result(json_file, rows):
         Terminal().console.print(_table(place.robot, found, delays))
         if found.cpu_us_per_message is not None:
             Terminal(at.quiet).note(

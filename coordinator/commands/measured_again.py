@@ -10,17 +10,17 @@ from coordinator.baseline.check import CheckReport, check, check_plan, write_che
 from coordinator.baseline.payload import payload_plan, search_payload, write_payload
 from coordinator.commands.options import (
     AgainOptions,
-    AsJson,
     BaselineFolder,
     ConnectOptions,
     DynamicsFolder,
+    JsonFile,
     planned,
 )
 from coordinator.commands.run import run_attended
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.connection import new_sender
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.runtime.terminal import Terminal, new_table, write_result
 from coordinator.session.run import RunConfig
 from module_agent.model.errors import EXIT_FINDING, UsageError
 
@@ -29,7 +29,7 @@ CHECK, PAYLOAD = "check.json", "payload.json"
 
 @with_options
 def check_robot(
-    baseline: BaselineFolder, at: ConnectOptions, again: AgainOptions, as_json: AsJson = False
+    baseline: BaselineFolder, at: ConnectOptions, again: AgainOptions, json_file: JsonFile = None
 ) -> None:
     """Measure a robot again in a short run, and say which of its links changed since an earlier run.
 
@@ -39,9 +39,7 @@ def check_robot(
     after = measured_again(before, at, again, check_plan)
     report = check(before, after)
     write_check(after.folder / CHECK, report)
-    if as_json:
-        typer.echo(report.model_dump_json(indent=1, by_alias=True))
-    else:
+    if write_result(json_file, report):
         _print(report)
     if report.changed:
         raise typer.Exit(EXIT_FINDING)
@@ -70,7 +68,7 @@ def _print(report: CheckReport) -> None:
 
 @with_options
 def find_payload(
-    baseline: DynamicsFolder, at: ConnectOptions, again: AgainOptions, as_json: AsJson = False
+    baseline: DynamicsFolder, at: ConnectOptions, again: AgainOptions, json_file: JsonFile = None
 ) -> None:
     """Move a robot for some ten seconds, and identify its payload: mass, centre, inertia, and where it is.
 
@@ -80,7 +78,8 @@ def find_payload(
     after = measured_again(before, at, again, payload_plan)
     report = search_payload(before, after)
     write_payload(after.folder / PAYLOAD, report)
-    typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.summary))
+    if write_result(json_file, report):
+        typer.echo("\n".join(report.summary))
 
 
 def measured_again(

@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import AsJson
+from coordinator.commands.options import JsonFile
 from coordinator.merge.calibration_file import each_once, read_calibration, write_calibration
 from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_calibrations import merge_calibrations
 from coordinator.merge.merge_runs import merge_runs
 from coordinator.merge.report import MERGED, merge_report
 from coordinator.recording.run_folder import CALIBRATION, INFORMATION
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.runtime.terminal import new_table, print_table, write_result
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json
 
@@ -23,7 +23,7 @@ INCONSISTENT_ABOVE = 5.0
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of two or more runs, with dynamics.")],
     out: Annotated[Path, typer.Option(help="Folder for merged.json and imu_calibration.npz.")],
-    as_json: AsJson = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Combine what several runs measured of the same modules: inertial parameters, and the places of IMUs.
 
@@ -40,8 +40,7 @@ def merge(
     out.mkdir(parents=True, exist_ok=True)
     write_calibration(out / CALIBRATION, each_once(one for run in recordings for one in run))
     write_json(out / MERGED, report)
-    if as_json:
-        typer.echo(report.model_dump_json(indent=1))
+    if not write_result(json_file, report):
         return
     table = new_table(
         f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts",

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from coordinator.baseline.baseline_robot import load_baseline
-from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
 from coordinator.commands.views.monitor import MonitorScreen
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.messenger import Messenger
@@ -18,7 +18,7 @@ from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import read_session
-from coordinator.runtime.command_line import in_a_folder, with_options
+from coordinator.runtime.command_line import with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal
 from coordinator.synchronisation.round_trips import map_clocks
@@ -42,12 +42,7 @@ def monitor_robot(
     alarms_per_hour: Annotated[
         float, typer.Option(min=1e-6, max=1e3, help="Accepted rate of false alarms [1/h].")
     ] = ALARMS_PER_HOUR,
-    json_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--json", help="File to write findings to, one JSON object a line.", callback=in_a_folder
-        ),
-    ] = None,
+    json_file: JsonFile = None,
     speed: Speed = 1.0,
 ) -> None:
     """Monitor a robot that another program moves: report collisions, payloads, friction and wear.
@@ -58,10 +53,7 @@ def monitor_robot(
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     reference = build_reference(load_baseline(baseline))
     monitor = Monitor(reference, alarms_per_hour)
-    try:
-        screen = MonitorScreen(monitor, json_file, at.quiet)
-    except OSError as error:
-        raise UsageError(f"{json_file}: {error.strerror or error}") from error
+    screen = MonitorScreen(monitor, json_file, at.quiet)
     with screen:
         if recording is not None:
             _monitor_file(monitor, screen, recording)

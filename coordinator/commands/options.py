@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from coordinator.excitation.plan import Excitation, Mode, Motions, Plan, load_plan
 from coordinator.live_robot.connection import Place
+from coordinator.runtime.command_line import in_a_folder
 from coordinator.runtime.event_loop import check_speed
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.model.errors import UsageError
@@ -30,7 +31,15 @@ Expect = Annotated[
 Speed = Annotated[
     float, typer.Option(help="Speed of a simulated world, relative to real time.", callback=check_speed)
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Write the result as JSON to this file; - is standard output, in place of the table.",
+        callback=in_a_folder,
+    ),
+]
 WithReport = Annotated[
     bool, typer.Option("--report/--no-report", help="Write a page for people, report.html, into the folder.")
 ]

@@ -3,16 +3,24 @@
 import asyncio
 import dataclasses
 import inspect
-from collections.abc import Callable, Mapping
+import logging
+import os
+from collections.abc import Callable, Collection, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn, get_type_hints
+from types import MappingProxyType
+from typing import Annotated, Any, NoReturn, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from module_agent.model.errors import EXIT_INTERRUPTED, RobotError, UsageError
+from module_agent.model.errors import EXIT_CODES, EXIT_INTERRUPTED, RobotError, UsageError
+from module_agent.model.settings import LOG_LEVELS, SETTINGS, read_settings, variable
+from module_agent.model.suggestion import did_you_mean
+from module_agent.model.version import installed_version
+
+logger = logging.getLogger(__name__)
 
 # How a command may end early; everything else is a programming error.
 ENDINGS = (RobotError, asyncio.CancelledError, KeyboardInterrupt)
@@ -47,7 +55,18 @@ def in_a_folder(file: Path | None) -> Path | None:
     return file
 
 
-def lazy_app(program: str, help_text: str, package: str, table: Mapping[str, tuple[str, str]]) -> typer.Typer:
+_NO_EXAMPLES: Mapping[str, str] = MappingProxyType({})
+
+
+def lazy_app(
+    program: str,
+    help_text: str,
+    package: str,
+    table: Mapping[str, tuple[str, str]],
+    examples: Mapping[str, str] = _NO_EXAMPLES,
+    repeated: Collection[str] = tuple(SETTINGS),
+    aliases: Mapping[str, str] = _NO_EXAMPLES,
+) -> typer.Typer:
     """Return a program of these commands; the module of a command is imported when the command is called.
 
     Modules of commands import the estimators and take seconds to load; `--help` of the program lists the
@@ -59,6 +78,9 @@ def lazy_app(program: str, help_text: str, package: str, table: Mapping[str, tup
         help_text: what it does.
         package: where the modules of the commands are.
         table: by command, the place of its function (or group, a `typer.Typer`) in the package, and its help.
+        examples: by command, command lines that its help ends with.
+        repeated: names of the options that may be settings (see `settings`).
+        aliases: by names that commands had once and that no help lists, the place of their function.
     """
 
     class Commands(TyperGroup):
@@ -71,7 +93,14 @@ def lazy_app(program: str, help_text: str, package: str, table: Mapping[str, tup
             return list(table)
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            return _loaded(cmd_name, f"{package}.{table[cmd_name][0]}") if cmd_name in table else None
+            place = table[cmd_name][0] if cmd_name in table else aliases.get(cmd_name)
+            if place is None:
+                return None
+            command = _loaded(cmd_name, f"{package}.{place}")
+            if example := examples.get(cmd_name):
+                command.epilog = f"Example: {example}"
+            _take_settings(command, ctx, repeated)
+            return command
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             with formatter.section("Commands"):
@@ -82,25 +111,93 @@ def lazy_app(program: str, help_text: str, package: str, table: Mapping[str, tup
                 return super().invoke(ctx)
             except ENDINGS as error:
                 end = ending(error)
+                logger.debug("where it ended:", exc_info=error)
             except OSError as error:
                 if error.filename is None:
                     raise
                 end = RobotError(f"cannot use {error.filename}: {error.strerror}")
+                logger.debug("where it ended:", exc_info=error)
             typer.echo(f"{program}: {end}", err=True)
             raise typer.Exit(end.exit_code)
 
     app = typer.Typer(
         name=program,
         cls=Commands,
-        add_completion=False,
         no_args_is_help=True,
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
         help=help_text,
+        epilog="Exit codes: " + "; ".join(f"{code} {meaning}" for code, meaning in EXIT_CODES.items()) + ".",
     )
-    # Without a callback typer takes a program for a single command.
-    app.callback()(lambda: None)
+
+    @app.callback()
+    def options(
+        context: typer.Context,
+        version: Annotated[
+            bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+        ] = False,
+        log_level: Annotated[
+            str,
+            typer.Option(
+                "--log-level", "-v", metavar="LEVEL", help=f"Log to stderr: {', '.join(LOG_LEVELS)}."
+            ),
+        ] = "",
+    ) -> None:
+        context.obj = read_settings(os.environ, Path()) if context.obj is None else context.obj
+        log(log_level or os.environ.get(variable("log_level")) or context.obj.get("log_level", "warning"))
+
     return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(installed_version())
+        raise typer.Exit
+
+
+def log(level: str) -> None:
+    """Log to standard error from this level on; at `debug` and `info` Zenoh says what it does as well.
+
+    Raises:
+        UsageError: there is no such level.
+    """
+    if level not in LOG_LEVELS:
+        raise UsageError(
+            f"--log-level {level}: it must be one of {', '.join(LOG_LEVELS)}{did_you_mean(level, LOG_LEVELS)}"
+        )
+    if level != "warning":  # which is Python's own default
+        logging.basicConfig(level=level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    if level in ("debug", "info"):
+        os.environ.setdefault("RUST_LOG", f"zenoh={level}")
+
+
+def _take_settings(command: Any, context: Any, names: Collection[str]) -> None:
+    """Let the options of a command that repeat be settings: variables of the environment, or of the file."""
+    settings = context.obj if context.obj is not None else read_settings(os.environ, Path())
+    context.obj = settings
+    repeated = [p for p in command.params if p.param_type_name == "option" and p.name in names]
+    for option in repeated:
+        option.envvar = variable(option.name)
+    defaults = {option.name: settings[option.name] for option in repeated if option.name in settings}
+    context.default_map = {**(context.default_map or {}), command.name: defaults}
+    invoke = command.invoke
+
+    def invoke_by_rank(called: Any) -> Any:
+        # Routers of a setting do not take the place of the endpoint that a command line gives.
+        if "connect" in called.params and _rank(called, "listen") > _rank(called, "connect"):
+            called.params["connect"] = None
+        return invoke(called)
+
+    command.invoke = invoke_by_rank
+
+
+_RANKS = ("DEFAULT", "DEFAULT_MAP", "ENVIRONMENT", "COMMANDLINE")
+
+
+def _rank(called: Any, option: str) -> int:
+    """Return what takes precedence: a command line over a variable over the file over the default."""
+    source = called.get_parameter_source(option)
+    return _RANKS.index(source.name) if source is not None and source.name in _RANKS else 0
 
 
 def _loaded(name: str, place: str) -> Any:

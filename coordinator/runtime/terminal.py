@@ -1,6 +1,9 @@
 """Terminal output: tables, and a progress line with notes above it; plain lines in a pipe."""
 
+import json
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Self
 
 from rich.console import Console
@@ -8,6 +11,9 @@ from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from module_agent.model.errors import UsageError
+from module_agent.model.files import json_text, write_json
 
 _MIN_PIPE_WIDTH = 150
 
@@ -21,6 +27,53 @@ def new_table(title: str | None, columns: str, **appearance: Any) -> Table:
     for name in columns.split(" | "):
         table.add_column(escape(name.lstrip(">")), justify="right" if name.startswith(">") else "left")
     return table
+
+
+STANDARD_OUTPUT = Path("-")
+
+
+def write_result(file: Path | None, document: object) -> bool:
+    """Write a command's result as JSON to a file, or to standard output; return whether people see it there.
+
+    Without a file nothing is written. The document is a pydantic model, or plain data without NaN.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if file == STANDARD_OUTPUT:
+        sys.stdout.write(json_text(document))
+        sys.stdout.flush()
+    elif file is not None:
+        write_json(file, document)
+    return file != STANDARD_OUTPUT
+
+
+class JsonLines:
+    """Writes one JSON object a line as it comes, to a file or to standard output; nothing without a file.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+
+    def __init__(self, file: Path | None):
+        self.to_standard_output = file == STANDARD_OUTPUT
+        try:
+            opened = None if file is None or self.to_standard_output else file.open("w", encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"{file}: {error.strerror or error}") from error
+        self._file = opened
+
+    def write(self, what: Mapping[str, object]) -> None:
+        """Write a line."""
+        stream = sys.stdout if self.to_standard_output else self._file
+        if stream is not None:
+            stream.write(json.dumps(what) + "\n")
+            stream.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
 
 
 def figure(value: float | None, form: str, unit: str = "") -> str:

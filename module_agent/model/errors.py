@@ -5,6 +5,16 @@ is a programming error and ends it with a traceback; a RobotError is therefore n
 """
 
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_SUSPECT, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
+# What the codes of all programs mean; 128 + n is the end by signal n.
+EXIT_CODES = {
+    0: "done",
+    EXIT_FAILED: "failed: the last line says why, and what is kept",
+    EXIT_USAGE: "wrong usage: an option, a path or a file cannot be used; nothing was begun",
+    EXIT_LOST: "a module was lost; it is named",
+    EXIT_FINDING: "done, and found something: a change, a collision, a missed bar",
+    EXIT_SUSPECT: "done, but sensors contradict each other or the recording is damaged",
+    EXIT_INTERRUPTED: "interrupted by Ctrl-C; the robot is stopped",
+}
 
 
 class RobotError(Exception):

@@ -43,8 +43,15 @@ def write_json(path: Path, document: object) -> None:
         OSError: the file cannot be written.
         ValueError: a number is not finite.
     """
+    write_text(path, json_text(document))
+
+
+def json_text(document: object) -> str:
+    """Return the JSON of a pydantic model (by alias), or of plain data without NaN and infinities.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
     if isinstance(document, BaseModel):
-        text = document.model_dump_json(indent=1, by_alias=True)
-    else:
-        text = json.dumps(document, indent=1, allow_nan=False)
-    write_text(path, text + "\n")
+        return document.model_dump_json(indent=1, by_alias=True) + "\n"
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"

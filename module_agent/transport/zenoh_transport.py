@@ -266,6 +266,8 @@ def open_zenoh(config: ZenohConfig) -> ZenohTransport:
         EndpointInUse: another program listens there, most often another coordinator.
         TransportError: an endpoint is malformed or cannot be listened on.
     """
+    # Of the variable RUST_LOG, which `--log-level` sets; without it nothing is logged.
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     try:
         for endpoint in (*config.listen, *config.connect):
             check_endpoint(endpoint)

@@ -52,11 +52,16 @@ class Results(NamedTuple):
 
 def write_results(path: Path, results: Results) -> None:
     """Write the results as JSON; the file is the complete old or the complete new one."""
+    write_json(path, document(results))
+
+
+def document(results: Results) -> dict[str, object]:
+    """Return the results as plain data, with the versions that they were measured with."""
     costs = [
         {"case": case.case, "trials": case.trials, "cpu_time_s": round(case.cpu_s, 2)}
         for case in results.cases
     ]
-    document = {
+    return {
         "schema": SCHEMA,
         "benchmark": results.benchmark,
         "settings": results.settings,
@@ -66,7 +71,6 @@ def write_results(path: Path, results: Results) -> None:
         "costs": costs,
         "wall_time_s": results.wall_time_s,
     }
-    write_json(path, document)
 
 
 _OURS, _MISSED, _THESIS, _BOUND, _BAR = "#1f5fa8", "#c0261c", "#d07a1f", "#606060", "#2f7d32"

@@ -9,10 +9,12 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from coordinator.commands.options import JsonFile
 from coordinator.excitation.plan import Motions
 from coordinator.runtime.command_line import in_a_folder
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.runtime.terminal import STANDARD_OUTPUT, new_table, print_table, write_result
 from module_agent.model.errors import EXIT_FINDING, UsageError
+from module_agent.model.suggestion import did_you_mean
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
 from sim.benchmark.cases.suites import (
@@ -27,10 +29,10 @@ from sim.benchmark.cases.suites import (
     kinematic_cases,
     over_all,
 )
-from sim.benchmark.report import Results, plot, write_results
+from sim.benchmark.report import Results, document, plot
 from sim.benchmark.row import Limit, Row
 from sim.benchmark.workers import run_cases
-from sim.commands.experiment import JsonFile, WorkerCount, experiment, worker_count
+from sim.commands.experiment import WorkerCount, experiment, worker_count
 from sim.commands.options import Seed
 
 app = typer.Typer(
@@ -129,18 +131,20 @@ def _benchmark(
     only = str(settings["only"])
     selected = chosen(cases, only)
     if not selected:
-        raise UsageError(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases))
+        near = did_you_mean(only, [case.name for case in cases])
+        raise UsageError(
+            f"--only {only}: no such case{near}; they are\n  " + "\n  ".join(c.name for c in cases)
+        )
     started_s = time.monotonic()
     measured = _run(selected, worker_count(processes))
     results = Results(name, settings, measured, over_all(measured), time.monotonic() - started_s)
-    print_table(table(results.rows, f"Benchmark of {name}"))
+    if write_result(json_file, document(results)):
+        print_table(table(results.rows, f"Benchmark of {name}"))
     for text in results.failures:
         typer.echo(f"failed: {text}", err=True)
     held = sum(row.holds is True for row in results.rows)
     cost = f"{results.wall_time_s:.0f} s, of processors {results.cpu_time_s:.0f} s"
-    typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}")
-    if json_file is not None:
-        write_results(json_file, results)
+    typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}", err=json_file == STANDARD_OUTPUT)
     if plot_file is not None:
         plot(results.rows, plot_file)
     if results.missed:

@@ -1,6 +1,5 @@
 """`x5-sim compare-log`: a real module's log against the simulated module."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,11 +7,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.commands.options import AsJson
+from coordinator.commands.options import JsonFile
 from coordinator.runtime.command_line import fail, with_options
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.runtime.terminal import new_table, print_table, write_result
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
 from module_agent.model.errors import EXIT_FAILED, UsageError
+from module_agent.model.files import write_json
 from sim.commands.experiment import ModuleOptions, ProfileName
 from sim.real_module.comparison import CommandRefused, SignalRow, compare, simulate
 from sim.real_module.real_log import read_log
@@ -33,7 +33,7 @@ def compare_log(
     out: Annotated[
         Path | None, typer.Option(help="Plot to write; its figures go next to it as JSON [LOG.png].")
     ] = None,
-    as_json: AsJson = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Run a real module's commands through the simulated module and compare what both did."""
     try:
@@ -54,14 +54,13 @@ def compare_log(
     rows = compare(recorded, simulated)
     picture = out if out is not None else Path(f"{log.stem}.png")
     signals = [row._asdict() for row in rows]
-    text = json.dumps({"log": log.name, "type": kind, "noise": modules.noise, "signals": signals}, indent=2)
+    document = {"log": log.name, "type": kind, "noise": modules.noise, "signals": signals}
     try:
         plot(recorded, simulated, f"{log.stem}: a real {kind} and the simulated one", picture)
-        picture.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+        write_json(picture.with_suffix(".json"), document)
     except (ValueError, OSError) as error:
         raise UsageError(f"cannot write {picture}: {error}") from error
-    if as_json:
-        typer.echo(text)
+    if not write_result(json_file, document):
         return
     print_table(_table(rows))
     typer.echo(f"{picture}, {picture.with_suffix('.json')}")

@@ -1,13 +1,12 @@
 """`x5-sim effects`: the table of effects, also as the page `docs/effects.md`."""
 
-import json
 from collections.abc import Iterable
 from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import AsJson
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.commands.options import JsonFile
+from coordinator.runtime.terminal import new_table, print_table, write_result
 from module_agent.model.catalogue import module_type
 from module_agent.network_emulation.profile import PROFILES
 from sim.actuator.actuator import BUS_VOLTAGE_V, SPRING_LOSS_S, STOP_NM_RAD
@@ -44,16 +43,15 @@ says otherwise; they are drawn once per module from the seed. The network is cho
 
 
 def effects(
-    as_json: AsJson = False,
+    json_file: JsonFile = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a page of Markdown.")] = False,
 ) -> None:
     """List the imperfections of a simulated module, which `--with` and `--without` switch."""
     if markdown:
         typer.echo(page(), nl=False)
-    elif as_json:
-        rows = [effect._asdict() | {"profiles": profiles_with(effect)} for effect in EFFECTS.values()]
-        typer.echo(json.dumps(rows, indent=2))
-    else:
+        return
+    rows = [effect._asdict() | {"profiles": profiles_with(effect)} for effect in EFFECTS.values()]
+    if write_result(json_file, rows):
         table = new_table(None, "effect | part | model | size | in the profiles", show_lines=True)
         for name, effect in EFFECTS.items():
             profiles = ", ".join(profiles_with(effect))

@@ -5,12 +5,11 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from coordinator.runtime.command_line import fail, in_a_folder
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import SIGNALS
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
@@ -23,7 +22,6 @@ ProfileName = Annotated[str, typer.Option("--noise", help=f"Noise profile: {', '
 WorkerCount = Annotated[
     int | None, typer.Option("--processes", min=1, help="Processes that share the work [one for each core].")
 ]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to write.", callback=in_a_folder)]
 
 
 @dataclass(frozen=True, kw_only=True)

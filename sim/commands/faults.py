@@ -6,14 +6,14 @@ from typing import Annotated, Any
 
 import typer
 
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.commands.options import JsonFile
+from coordinator.runtime.terminal import STANDARD_OUTPUT, new_table, print_table, write_result
 from module_agent.model.errors import EXIT_FINDING, UsageError
-from module_agent.model.files import write_json
 from module_agent.network_emulation.profile_file import network as check_network
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.dask_cluster import run_trials_on
 from sim.benchmark.workers import run_trials
-from sim.commands.experiment import JsonFile, experiment, worker_count
+from sim.commands.experiment import experiment, worker_count
 from sim.commands.options import load
 from sim.faults.fault import Fault, fault_of
 from sim.faults.report import OUTCOMES, SeedReport, by_fault, run_seed
@@ -54,7 +54,8 @@ def faults(
     trials = [Trial(run_seed, (schedule, shrink), COST_S) for schedule in schedules]
     outcomes = _run(trials, workers, dask)
     reports = [one for one in outcomes if isinstance(one, SeedReport)]
-    _print_table(reports)
+    if write_result(json_file, figures(numbers, outcomes)):
+        _print_table(reports)
     violated = 0
     for seed, one in zip(numbers, outcomes, strict=True):
         if isinstance(one, Failed):
@@ -66,10 +67,9 @@ def faults(
     named = [one.named_rightly for one in reports if one.named_rightly is not None]
     typer.echo(
         f"{len(numbers)} seeds, {violated} with violations; {sum(named)} of {len(named)} errors and "
-        "suspicions name what happened"
+        "suspicions name what happened",
+        err=json_file == STANDARD_OUTPUT,
     )
-    if json_file is not None:
-        write_json(json_file, figures(numbers, outcomes))
     if violated:
         raise typer.Exit(EXIT_FINDING)
 

@@ -1,6 +1,5 @@
 """`x5-sim fleet`: several robots with a coordinator each on Zenoh routers, and what they cost."""
 
-import json
 import signal
 import socket
 import tempfile
@@ -12,11 +11,11 @@ from typing import Annotated
 
 import typer
 
+from coordinator.commands.options import JsonFile
 from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import SIGNALS, ignore_signals
-from coordinator.runtime.terminal import new_table, print_table
-from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, UsageError
-from module_agent.model.files import write_text
+from coordinator.runtime.terminal import new_table, print_table, write_result
+from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
 from sim.processes.fleet import FleetConfig, run_fleet
 from sim.processes.fleet_figures import summary, table_rows
 from sim.processes.fleet_plan import plan_fleet
@@ -42,7 +41,7 @@ def fleet(
         bool, typer.Option("--move", help="Hold all joints and move one of each robot at a time.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for logs and truths [a temporary one].")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Run several robots with a coordinator each on Zenoh routers, and measure what they cost.
 
@@ -55,8 +54,6 @@ def fleet(
     Exit codes: 0 measured, 1 a process did not start or ended early, 2 wrong usage, 130 interrupted.
     """
     plan = plan_fleet(robots, modules, _endpoints(routers, port), processes)
-    if json_file is not None and not json_file.parent.is_dir():
-        raise UsageError(f"--json {json_file}: there is no folder {json_file.parent}")
 
     def stop(number: int, _frame: FrameType | None) -> None:
         ignore_signals()
@@ -74,11 +71,10 @@ def fleet(
     table = new_table(None, "process | number | CPU % | MiB | threads | sockets")
     for row in table_rows(figures):
         table.add_row(*row)
-    print_table(table)
-    typer.echo(summary(figures))
-    if json_file is not None:
-        kinds = {kind: each._asdict() for kind, each in figures.kinds.items()}
-        write_text(json_file, json.dumps({**figures._asdict(), "kinds": kinds}, indent=1) + "\n")
+    kinds = {kind: each._asdict() for kind, each in figures.kinds.items()}
+    if write_result(json_file, {**figures._asdict(), "kinds": kinds}):
+        print_table(table)
+        typer.echo(summary(figures))
 
 
 def _endpoints(count: int, first_port: int | None) -> tuple[str, ...]:

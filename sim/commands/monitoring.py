@@ -7,9 +7,9 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from coordinator.commands.options import JsonFile
 from coordinator.monitoring.findings import KINDS, UNITS, Kind
-from coordinator.runtime.terminal import figure, new_table, print_table
-from module_agent.model.files import write_json
+from coordinator.runtime.terminal import figure, new_table, print_table, write_result
 from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
     AFTER_S,
@@ -28,7 +28,7 @@ from sim.benchmark.cases.monitoring import (
     monitoring_trial,
     sum_of,
 )
-from sim.commands.experiment import JsonFile, ProfileName, WorkerCount, experiment, trial_results
+from sim.commands.experiment import ProfileName, WorkerCount, experiment, trial_results
 from sim.commands.options import Seed, load
 from sim.imperfections.noise_profile import noise_profile
 
@@ -61,6 +61,8 @@ def monitoring(
     happened = [one for one in results if isinstance(one, MonitoringTrial)]
     quiet = [one for one in results if isinstance(one, Alarms)]
     alarms = sum_of(quiet)
+    if not write_result(json_file, figures(happened, alarms)):
+        return
     print_table(confusion_table(happened))
     print_table(size_table(happened))
     low, high = alarms.interval_per_hour()
@@ -68,8 +70,6 @@ def monitoring(
         f"{alarms.alarms} false alarms in {alarms.monitored_s / 3600.0:.2f} h of motion: "
         f"{alarms.per_hour:.2f} an hour, 95 % interval {low:.2f} to {high:.2f}"
     )
-    if json_file is not None:
-        write_json(json_file, figures(happened, alarms))
 
 
 def confusion_table(trials: Sequence[MonitoringTrial]) -> Table:

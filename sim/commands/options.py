@@ -94,7 +94,9 @@ class LaunchOptions:
             min=1, help="Agent processes that share the modules [one a core, or one for each 8 modules]."
         ),
     ] = None
-    endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = DEFAULT_ENDPOINT
+    listen: Annotated[str, typer.Option(help="Zenoh endpoint that the coordinator listens on.")] = (
+        DEFAULT_ENDPOINT
+    )
     secure: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Speak mutual TLS, keys in this folder; makes what is missing."),
@@ -129,7 +131,7 @@ class LaunchOptions:
         """
         if self.network is not None:
             network_named(self.network)
-        check_endpoint(self.endpoint)
+        check_endpoint(self.listen)
 
     def new_folder(self, robot: Robot) -> Path:
         """Return the folder of the run; it must not hold one, since the truth is written there as well.

@@ -102,7 +102,7 @@ def _launch(
         network=launched.network or robot.network,
         noise=settings.choice(),
         speed=settings.speed,
-        endpoint=launched.endpoint,
+        endpoint=launched.listen,
         processes=launched.processes or default_processes(len(robot.serials)),
         pushes=tuple(settings.push or ()),
         imu_rate_hz=settings.imu_rate_hz,

@@ -6,22 +6,20 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.commands.options import AsJson
-from coordinator.runtime.terminal import figure, new_table, print_table
+from coordinator.commands.options import JsonFile
+from coordinator.runtime.terminal import figure, new_table, print_table, write_result
 from module_agent.model.files import write_json
 from sim.scoring.score import Score, score
 
 
 def score_run(
     folder: Annotated[Path, typer.Argument(help="Folder of a run.")],
-    as_json: AsJson = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Compare a run's result with the simulator's truth."""
     result = score(folder)
     write_json(folder / "score.json", result)
-    if as_json:
-        typer.echo((folder / "score.json").read_text())
-    else:
+    if write_result(json_file, result):
         print_table(table(result))
 
 

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import UsageError
+from module_agent.model.suggestion import did_you_mean
 from sim.geometry.link_parts import Strict
 from sim.imperfections.effects import EFFECTS, Effect
 
@@ -179,7 +180,9 @@ def switched(profile: NoiseProfile, on: tuple[str, ...] = (), off: tuple[str, ..
 
 def _effect(name: str) -> Effect:
     if name not in EFFECTS:
-        raise UsageError(f"unknown effect {name!r}; known are {', '.join(EFFECTS)}")
+        raise UsageError(
+            f"unknown effect {name!r}{did_you_mean(name, EFFECTS)}; known are {', '.join(EFFECTS)}"
+        )
     return EFFECTS[name]
 
 

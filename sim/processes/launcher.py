@@ -16,6 +16,7 @@ from module_agent.control.safety import Safety
 from module_agent.control.safety_file import safety_toml
 from module_agent.main import ATTACHED
 from module_agent.model.errors import RobotError
+from module_agent.model.settings import SETTINGS, SETTINGS_VARIABLE, variable
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from sim.hebi_stand_in import on_bus
 from sim.physics.engine import Physics
@@ -99,6 +100,13 @@ class Child(NamedTuple):
 def _die_with_parent() -> None:
     # A launcher that is killed outright cannot stop its children; the kernel does it then.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment of the processes: a launch says all, and no settings of a user change it."""
+    settings = {variable(name) for name in SETTINGS}
+    kept = {name: value for name, value in os.environ.items() if name not in settings}
+    return {**kept, SETTINGS_VARIABLE: "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 class Launcher:
@@ -265,7 +273,7 @@ def start_child(
             stderr=subprocess.STDOUT if log is not None else None,
             start_new_session=True,
             preexec_fn=_die_with_parent,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **environment},
+            env=_environment() | dict(environment),
         )
     return Child(name, process, log, up)
 

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, Va
 
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError, UsageError
+from module_agent.model.suggestion import did_you_mean
 from module_agent.model.toml_location import Location, fault_lines, faults_of, parse_toml
 from module_agent.network_emulation.profile_file import network as network_profile
 from module_agent.network_emulation.profile_file import network_relative_to
@@ -260,8 +261,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
     path = ROBOTS / f"{name_or_path}.toml" if str(name_or_path) in shipped_robots() else Path(name_or_path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"{name_or_path} is neither a robot file nor a shipped robot; "
-            f"shipped are {', '.join(shipped_robots())}"
+            f"{name_or_path} is neither a robot file nor a shipped robot"
+            f"{did_you_mean(str(name_or_path), shipped_robots())}; shipped are {', '.join(shipped_robots())}"
         )
     return parse_robot(path.read_text(encoding="utf-8"), str(path))
 

@@ -13,6 +13,7 @@ import module_agent
 import sim
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
+from module_agent.model.suggestion import did_you_mean
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, Unit
 
 _SOURCES = (".py", ".toml")
@@ -28,7 +29,9 @@ def selected(known: Sequence[Experiment], only: Sequence[str] = ()) -> tuple[Exp
     names = [each.id for each in known]
     for name in only:
         if name not in names:
-            raise UsageError(f"no experiment {name!r}; there are {', '.join(names)}")
+            raise UsageError(
+                f"no experiment {name!r}{did_you_mean(name, names)}; there are {', '.join(names)}"
+            )
     return tuple(each for each in known if not only or each.id in only)
 
 

@@ -23,7 +23,7 @@ def floating(launcher, known_folder, tmp_path):
         process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "coordinator.main", "compensate", str(folder or known_folder(ROBOT))),
-                *("--listen", robot.config.endpoint, "--network", "lan", "--json", *options),
+                *("--listen", robot.config.endpoint, "--network", "lan", "--json", "-", *options),
             ],
             stdin=subprocess.DEVNULL,
             stdout=out,

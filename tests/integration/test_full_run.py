@@ -32,7 +32,7 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
 ) -> None:
     real, virtual, again = tmp_path / "real", tmp_path / "virtual", tmp_path / "again"
     options = ("--plan", str(plan), "--network", "lan", "--quiet", "--no-report")
-    done = programs.run("sim.main", "run", ROBOT, "--out", str(real), "--endpoint", endpoint, *options)
+    done = programs.run("sim.main", "run", ROBOT, "--out", str(real), "--listen", endpoint, *options)
     assert done.returncode == 0, done.stderr
     assert [name for name in FILES if not (real / name).is_file()] == []
     score = json.loads((real / "score.json").read_text())

@@ -19,7 +19,7 @@ def test_ctrl_c_stops_everything_and_keeps_what_was_recorded(
     command += ["--no-report"]
     with log.open("wb") as output:
         launch = subprocess.Popen(
-            [*command, "--out", str(out), "--plan", str(plan), "--endpoint", endpoint],
+            [*command, "--out", str(out), "--plan", str(plan), "--listen", endpoint],
             stdout=output,
             stderr=subprocess.STDOUT,
         )
@@ -52,7 +52,7 @@ def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
     ear.motion(config.serials[0], "windowed_sine", 50, coordinator)
     where = ("--robot", config.robot_name, "--listen", config.endpoint)
 
-    listed = programs.run("coordinator.main", "list", "--json", *where)
+    listed = programs.run("coordinator.main", "list", "--json", "-", *where)
     assert listed.returncode == 0, listed.stderr
     modules = json.loads(listed.stdout)
     assert [m["serial"] for m in modules] == sorted(config.serials)

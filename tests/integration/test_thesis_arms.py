@@ -12,7 +12,7 @@ def test_an_arm_of_the_thesis_is_identified_over_zenoh(
 ) -> None:
     out = tmp_path / "run"
     options = ("--plan", str(plan), "--network", "lan", "--no-dynamics", "--quiet", "--no-report")
-    done = programs.run("sim.main", "run", robot, "--out", str(out), "--endpoint", endpoint, *options)
+    done = programs.run("sim.main", "run", robot, "--out", str(out), "--listen", endpoint, *options)
     assert done.returncode == 0, done.stderr
     score = json.loads((out / "score.json").read_text())
     assert score["topology_correct"]

@@ -50,7 +50,7 @@ def test_a_folder_that_holds_a_run_is_not_written_over(programs, tmp_path, endpo
     for command in (
         ("coordinator.main", "run", "--listen", endpoint),
         ("sim.main", "run", ROBOT, "--virtual"),
-        ("sim.main", "run", ROBOT, "--endpoint", endpoint),
+        ("sim.main", "run", ROBOT, "--listen", endpoint),
     ):
         said = refused(programs.run(*command, "--out", str(out)))
         assert f"{out} holds a run already" in said

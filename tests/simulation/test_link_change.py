@@ -119,7 +119,7 @@ def test_the_command_says_so_and_exits_with_4(days: Days, monkeypatch: pytest.Mo
     arguments = ["check", str(days.known.folder), "--measured"]
     sound = CliRunner().invoke(app, [*arguments, str(days.sound.folder)])
     assert sound.exit_code == 0, sound.output
-    slipped = CliRunner().invoke(app, [*arguments, str(days.changed.folder), "--json"])
+    slipped = CliRunner().invoke(app, [*arguments, str(days.changed.folder), "--json", "-"])
     assert slipped.exit_code == EXIT_FINDING
     written = json.loads((days.changed.folder / CHECK).read_text())
     assert written["changed"] is True

@@ -1,14 +1,14 @@
 """Gravity compensation in the terminal: a live table, plain lines in a pipe, or lines of JSON."""
 
-import json
 from collections.abc import Callable
 from math import degrees
+from pathlib import Path
 
 from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.table import Table
 
-from coordinator.runtime.terminal import Displayed, new_table, print_table
+from coordinator.runtime.terminal import Displayed, JsonLines, new_table, print_table
 from coordinator.torque_control.session import Moment
 from coordinator.torque_control.summary import CompensationSummary
 
@@ -19,17 +19,19 @@ LIVE_S, LINE_S = 0.25, 0.5
 class CompensationView(Displayed):
     """Shows moments at intervals; `now_s` is the clock of the session.
 
-    Use as a context manager. Notes, and what is live, go to standard error; lines of JSON and the summary to
-    standard output.
+    Use as a context manager. Notes, and what is live, go to standard error, the summary to standard output;
+    lines of JSON to `json_file`, where - is standard output and takes the place of the others.
     """
 
-    def __init__(self, serials: tuple[str, ...], now_s: Callable[[], float], as_json: bool, quiet: bool):
+    def __init__(
+        self, serials: tuple[str, ...], now_s: Callable[[], float], json_file: Path | None, quiet: bool
+    ):
         self._serials = serials
         self._now_s = now_s
-        self._as_json, self._quiet = as_json, quiet
+        self._lines, self._quiet = JsonLines(json_file), quiet
         console = Console(stderr=True, highlight=False, quiet=quiet)
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        super().__init__(console, None if as_json else self._live)
+        super().__init__(console, None if self._lines.to_standard_output else self._live)
         self._due_s = 0.0
 
     def moment(self, now: Moment) -> None:
@@ -38,18 +40,19 @@ class CompensationView(Displayed):
         if now_s < self._due_s:
             return
         self._due_s = now_s + (LIVE_S if self._display is not None else LINE_S)
-        if self._as_json:
-            print(json.dumps(moment_fields(self._serials, now)), flush=True)
-        elif self._display is not None:
+        self._lines.write(moment_fields(self._serials, now))
+        if self._lines.to_standard_output:
+            return
+        if self._display is not None:
             self._live.update(moment_table(self._serials, now), refresh=True)
         else:
             self.console.print(moment_line(self._serials, now), markup=False, soft_wrap=True)
 
     def summary(self, found: CompensationSummary) -> None:
         """Print the summary."""
-        if self._as_json:
-            print(json.dumps(summary_fields(found)), flush=True)
-        elif not self._quiet:
+        self._lines.write(summary_fields(found))
+        self._lines.close()
+        if not self._quiet and not self._lines.to_standard_output:
             print_table(summary_table(found))
 
 

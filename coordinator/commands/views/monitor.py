@@ -1,8 +1,6 @@
 """Findings of the monitor: a live table on a terminal, lines in a pipe; and a JSON file."""
 
-import json
 from pathlib import Path
-from typing import TextIO
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -10,7 +8,7 @@ from rich.text import Text
 
 from coordinator.monitoring.findings import Finding, Key
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from coordinator.runtime.terminal import Displayed, new_table
+from coordinator.runtime.terminal import Displayed, JsonLines, new_table
 
 _NOTES = 6
 
@@ -22,15 +20,14 @@ class MonitorScreen(Displayed):
         self.start_ns = 0
         self._monitor = monitor
         self._notes: list[str] = []
-        self._file: TextIO | None = json_file.open("w", encoding="utf-8") if json_file else None
-        console = Console(highlight=False, quiet=quiet)
+        self._lines = JsonLines(json_file)
+        console = Console(highlight=False, quiet=quiet or self._lines.to_standard_output)
         self._live = Live(get_renderable=self._shown, console=console, refresh_per_second=4.0)
         super().__init__(console, self._live)
 
     def __exit__(self, *_: object) -> None:
         super().__exit__()
-        if self._file is not None:
-            self._file.close()
+        self._lines.close()
 
     def report(self, update: MonitorUpdate) -> None:
         """Show what is new."""
@@ -70,9 +67,7 @@ class MonitorScreen(Displayed):
             self._notes = [*self._notes, text][-_NOTES:]
 
     def _write(self, what: dict[str, object]) -> None:
-        if self._file is not None:
-            self._file.write(json.dumps(what) + "\n")
-            self._file.flush()
+        self._lines.write(what)
 
     def _shown(self) -> Group:
         monitor, outside = self._monitor, self._monitor.outside_nm

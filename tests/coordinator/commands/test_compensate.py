@@ -85,7 +85,7 @@ def test_a_moment_is_a_line_in_a_pipe_and_a_row_a_joint_in_a_terminal() -> None:
 
 def test_lines_of_json_come_twice_a_second_and_hold_si_units(capsys: pytest.CaptureFixture[str]) -> None:
     now = [0.0]
-    with CompensationView(SERIALS, lambda: now[0], as_json=True, quiet=True) as view:
+    with CompensationView(SERIALS, lambda: now[0], json_file=Path("-"), quiet=True) as view:
         for k in range(201):
             now[0] = 100.0 + 0.005 * k
             view.moment(moment(0.005 * k))

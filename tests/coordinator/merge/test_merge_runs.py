@@ -332,7 +332,7 @@ def test_the_command_merges_folders_and_says_by_how_much(tmp_path: Path) -> None
         (tmp_path / name).mkdir()
         write_information(tmp_path / name / INFORMATION, measured(rng, assembled(rng, order)))
     folders = [str(tmp_path / name) for name in ("one", "two")]
-    done = CliRunner().invoke(app, ["merge", *folders, "--out", str(tmp_path / "both"), "--json"])
+    done = CliRunner().invoke(app, ["merge", *folders, "--out", str(tmp_path / "both"), "--json", "-"])
     assert done.exit_code == 0, done.output
     said = json.loads(done.output)
     assert said == json.loads((tmp_path / "both" / "merged.json").read_text())

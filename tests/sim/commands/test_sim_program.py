@@ -40,7 +40,7 @@ ROBOT = "thesis_171_horizontal"
         (("run", ROBOT, "--virtual", "--noise", "loud"), "unknown noise profile 'loud'; known are ideal"),
         (("run", ROBOT, "--virtual", "--with", "wind"), "unknown effect 'wind'; known are friction"),
         (("launch", ROBOT, "--with", "heat", "--without", "heat"), "'heat' is switched both on and off"),
-        (("launch", ROBOT, "--endpoint", "nonsense"), "endpoint 'nonsense': it must look like tcp/"),
+        (("launch", ROBOT, "--listen", "nonsense"), "endpoint 'nonsense': it must look like tcp/"),
         (("launch", ROBOT, "--viewer", "foo"), "--viewer foo: it must be none, spawn, serve or an address"),
         (("launch", ROBOT, "--processes", "0"), "greater than or equal to 1"),
     ],

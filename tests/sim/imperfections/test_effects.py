@@ -96,6 +96,6 @@ def test_an_effect_that_is_on_keeps_its_size() -> None:
 
 
 def test_effects_are_listed_for_programs_too() -> None:
-    rows = json.loads(CliRunner().invoke(app, ["effects", "--json"]).output)
+    rows = json.loads(CliRunner().invoke(app, ["effects", "--json", "-"]).output)
     assert [row["name"] for row in rows] == list(EFFECTS)
     assert next(row for row in rows if row["name"] == "backlash")["profiles"] == ["poor"]

@@ -282,7 +282,7 @@ def test_the_command_writes_a_plot_and_figures_and_prints_them(tmp_path: Path) -
     assert done.exit_code == 0, done.output
     assert "winding current" in done.output
     assert out.read_bytes().startswith(b"\x89PNG")
-    shown = CliRunner().invoke(app, ["compare-log", str(path), "--out", str(out), "--json"])
+    shown = CliRunner().invoke(app, ["compare-log", str(path), "--out", str(out), "--json", "-"])
     found = json.loads(shown.stdout)
     assert found == json.loads(out.with_suffix(".json").read_text())
     assert [row["signal"] for row in found["signals"]] == list(SIGNALS)
