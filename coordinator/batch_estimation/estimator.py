@@ -66,6 +66,8 @@ class Refinement(NamedTuple):
     encoder_scale, encoder_scale_sigma: (n,) true motion over measured, less 1, as far as estimated; the
         chain takes the encoders as they are unless their scales were free.
     late_s: delay common to all IMUs, in addition to their own delays in `intrinsics`.
+    columns: (2, 2, k, n, 3) of gyro and accelerometer in each of k motions the rms of the residuals of every
+        axis, and the standard deviation of its readings.
     """
 
     estimate: ChainEstimate
@@ -81,6 +83,7 @@ class Refinement(NamedTuple):
     encoder_scale: Array
     encoder_scale_sigma: Array
     late_s: float = 0.0
+    columns: Array = frozen(np.zeros((2, 2, 0, 0, 3)))
 
     @property
     def chain(self) -> Chain:
@@ -223,7 +226,8 @@ def refine_chain(
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
     rms = [_rms(residual) for residual in expected.residuals]
     nuisance = _nuisance_covariance(normal, spectrum)
-    return _report(problem, state, spectrum, nuisance, by_noise, rms, white, scale)
+    refined = _report(problem, state, spectrum, nuisance, by_noise, rms, white, scale)
+    return refined._replace(columns=_columns(data, expected.residuals))
 
 
 def with_placement(chain: Chain, placement: Array) -> Chain:
@@ -290,6 +294,14 @@ def _rms(residual: Array) -> Array:
 def _spread(data: SensorData, residual: Array) -> Array:
     """Return the rms of every motion, (motions, n): turning gears shake an IMU more than gears at rest."""
     return np.stack([_rms(residual[samples]) for samples in data.motions])
+
+
+def _columns(data: SensorData, residuals: Sequence[Array]) -> Array:
+    """Return the rms of residuals and the deviation of readings by axis, see `Refinement.columns`."""
+    readings = data.gyro_rad_s, data.accel_m_s2
+    size = [[np.sqrt(np.mean(one[part] ** 2, axis=0)) for part in data.motions] for one in residuals]
+    spread = [[one[part].std(axis=0) for part in data.motions] for one in readings]
+    return frozen(np.array([[size[k], spread[k]] for k in range(2)]))
 
 
 def _repeats(data: SensorData, residual: Array) -> Array:

@@ -19,7 +19,7 @@ from coordinator.commands.options import (
 from coordinator.commands.run import run_attended
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.connection import new_sender
-from coordinator.runtime.command_line import with_options
+from coordinator.runtime.command_line import end_if_suspect, with_options
 from coordinator.runtime.terminal import Terminal, new_table, write_result
 from coordinator.session.run import RunConfig
 from module_agent.model.errors import EXIT_FINDING, UsageError
@@ -33,7 +33,8 @@ def check_robot(
 ) -> None:
     """Measure a robot again in a short run, and say which of its links changed since an earlier run.
 
-    Writes check.json. Exit codes: 0 nothing changed, 4 a link or the modules changed, others as of `run`.
+    Writes check.json. Exit codes: 0 nothing changed, 4 a link or the modules changed, 5 sensors of either run
+    are sick or a recording is damaged, so that changes may not be the robot's, others as of `run`.
     """
     before = load_baseline(baseline)
     after = measured_again(before, at, again, check_plan)
@@ -41,6 +42,7 @@ def check_robot(
     write_check(after.folder / CHECK, report)
     if write_result(json_file, report):
         _print(report)
+    end_if_suspect([*before.kinematics.suspicions, *after.kinematics.suspicions])
     if report.changed:
         raise typer.Exit(EXIT_FINDING)
 
@@ -80,6 +82,7 @@ def find_payload(
     write_payload(after.folder / PAYLOAD, report)
     if write_result(json_file, report):
         typer.echo("\n".join(report.summary))
+    end_if_suspect([*before.kinematics.suspicions, *after.kinematics.suspicions])
 
 
 def measured_again(

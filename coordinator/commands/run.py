@@ -15,7 +15,7 @@ from coordinator.recording.run_folder import REPORT, load_recording
 from coordinator.recording.session_file import SessionFileError
 from coordinator.report.plots import MissingPlots
 from coordinator.report.run_report import write_report
-from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
+from coordinator.runtime.command_line import ENDINGS, end_if_suspect, ending, fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal, new_table
 from coordinator.session.run import Run, RunConfig, write_outputs
@@ -58,7 +58,8 @@ def run(
 ) -> None:
     """Discover a robot, move its joints, and identify topology, kinematic chain and inertia.
 
-    Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 130 interrupted.
+    Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 5 sensors are sick, and
+    the result is without their modules, or there is none; 130 interrupted.
     """
     place = at.place()
     config = RunConfig(
@@ -80,6 +81,7 @@ def run(
     terminal.console.print(f"written to {out}{report_at(out)}", markup=False, soft_wrap=True)
     if viewer == "serve":
         terminal.note(f"the page has ended; to see the run again: x5-coordinator view {out} --serve")
+    end_if_suspect(result.suspicions)
 
 
 def replay(
@@ -87,7 +89,10 @@ def replay(
     out: Annotated[Path | None, typer.Option(help="Folder for result.json [folder of the session].")] = None,
     report: WithReport = True,
 ) -> None:
-    """Compute the result of a run again from its recording, without a robot."""
+    """Compute the result of a run again from its recording, without a robot.
+
+    Exit codes: 5 sensors are sick or the recording is damaged, others as of `run`.
+    """
     folder = out if out is not None else session.parent
     recording, terminal = load_recording(session), Terminal()
     # Before anything is identified: where that fails this may be why.
@@ -105,6 +110,7 @@ def replay(
         except MissingPlots as error:
             terminal.note(f"no report: {error}")
     terminal.console.print(f"written to {folder}{report_at(folder)}", markup=False, soft_wrap=True)
+    end_if_suspect(identified.result.suspicions)
 
 
 def run_attended(

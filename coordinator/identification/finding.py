@@ -27,6 +27,22 @@ Sickness = Literal[
     "messages_missing",
 ]
 
+# With one of these, if it is serious, nothing of a module can be used for the chain.
+UNUSABLE: frozenset[Sickness] = frozenset(
+    {
+        "gyro_stuck",
+        "gyro_saturated",
+        "gyro_contradicts",
+        "accelerometer_stuck",
+        "accelerometer_saturated",
+        "accelerometer_contradicts",
+        "encoder_stuck",
+        "encoder_jump",
+        "clock_jump",
+        "messages_missing",
+    }
+)
+
 
 class Finding(NamedTuple):
     """A sensor that contradicts its catalogue or the others.

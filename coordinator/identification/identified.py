@@ -7,7 +7,7 @@ import numpy as np
 from coordinator.batch_estimation.estimator import Refinement
 from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.dynamics.torque_prediction import TorqueError
-from coordinator.identification.finding import Finding, SensorError
+from coordinator.identification.finding import UNUSABLE, Finding, SensorError
 from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import Result
@@ -54,6 +54,12 @@ class Kinematics(NamedTuple):
     measured: tuple[CalibrationInformation, ...] = ()
     excluded: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
+
+    @property
+    def dynamic(self) -> bool:
+        """Whether torques tell of all bodies: no joint's motion is unknown, and every effort is measured."""
+        sick = UNUSABLE | {"effort_stuck"}
+        return not any(one.serious and one.kind in sick for one in self.findings)
 
     @property
     def suspicions(self) -> list[str]:

@@ -16,6 +16,7 @@ from coordinator.batch_estimation.imu_calibration import CalibrationInformation,
 from coordinator.batch_estimation.imu_intrinsics import beyond
 from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
+from coordinator.identification.finding import Finding, SensorError
 from coordinator.identification.gear_trains import gear_trains
 from coordinator.identification.identified import (
     HeldOutMotion,
@@ -40,6 +41,7 @@ from coordinator.identification.sensor_checks import (
     encoder_travels,
     misfits,
 )
+from coordinator.identification.signal_checks import sensor_findings, unusable
 from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
@@ -72,6 +74,7 @@ from module_agent.signals.filtering import NS_PER_S, REFINEMENT_CUTOFF_HZ, Joint
 # The largest of some 30 IMU errors, in standard deviations, is below this for 99 of 100 IMUs.
 OUTLIER_ABOVE = 3.5
 MIN_REST_ROWS = 10
+_NO_SOLUTION = "no robot follows from these readings: they do not vary, or contradict each other"
 # Motions that topology and chain are identified from.
 EXPLORING: tuple[Purpose, ...] = ("rest", "constant", "windowed_sine", "repeat", "whole")
 
@@ -100,7 +103,7 @@ def identify(
         kinematics = identify_kinematics(recording, measured, explored)
         kinematics = revise(kinematics) if revise is not None else kinematics
     inertia, bodies, held_out = None, None, None
-    if recording.latest_motions("dynamic"):
+    if recording.latest_motions("dynamic") and kinematics.dynamic:
         chain, serials, clocks = kinematics.fit.chain, kinematics.topology.serials, kinematics.clocks
         types = [recording.module_type(s) for s in serials]
         floor = base_floor(recording, clocks, kinematics.topology)
@@ -132,8 +135,10 @@ def identify_topology(recording: Recording) -> Topology:
     """
     try:
         return search_topology(recording, _explored(recording)).topology
-    except (DataError, np.linalg.LinAlgError) as error:
+    except DataError as error:
         raise IdentificationError.of(error) from error
+    except np.linalg.LinAlgError as error:
+        raise IdentificationError(f"{_NO_SOLUTION} ({error})") from error
 
 
 def identify_kinematics(
@@ -157,9 +162,64 @@ def identify_kinematics(
     """
     so_far = recording.explored
     if so_far is None or not _same_motions(so_far, recording):
-        return _identify_kinematics(recording, measured)
-    kept = explored if explored is not None else _identify_kinematics(so_far, measured)
+        return _without_sick(recording, measured)
+    kept = explored if explored is not None else _without_sick(so_far, measured)
     return _refreshed(kept, recording)
+
+
+def _without_sick(recording: Recording, measured: Sequence[CalibrationInformation]) -> Kinematics:
+    """Identify topology and chain of the modules whose sensors are not sick beyond doubt.
+
+    The robot without a module stands still in its joint: motions of several joints at once do not count then.
+    What only the fit shows is excluded one by one, as a sick sensor bends the model of the others as well.
+
+    Raises:
+        IdentificationError: as `identify`, also if nothing is left.
+    """
+    serials = _explored(recording)
+    findings = sensor_findings(recording, serials)
+    excluded = unusable(findings)
+    if any(finding.kind == "encoder_stuck" for finding in findings):
+        _check_not_exchanged(recording, serials)
+    while len(excluded) < len(serials):
+        try:
+            kept = recording.without(excluded) if excluded else recording
+            kinematics = _identify_kinematics(kept, measured)
+        except IdentificationError as error:
+            if not excluded or error.findings:
+                raise
+            text = (
+                f"{_summary(findings)}; the robot cannot be identified without {', '.join(excluded)}: {error}"
+            )
+            raise IdentificationError.of(SensorError(text, findings)) from error
+        sick = [one for one in kinematics.findings if unusable([one])]
+        if not sick:
+            return kinematics._replace(
+                findings=(*findings, *kinematics.findings),
+                excluded=excluded,
+                damage=tuple(recording.damage),
+            )
+        worst = max(sick, key=lambda one: one.sigmas)
+        findings, excluded = (*findings, worst), tuple(sorted((*excluded, worst.serial)))
+    raise IdentificationError.of(SensorError(f"{_summary(findings)}; no other module is left", findings))
+
+
+def _summary(findings: Sequence[Finding]) -> str:
+    return "; ".join(finding.summary for finding in findings)
+
+
+def _check_not_exchanged(recording: Recording, serials: Sequence[str]) -> None:
+    """Check that encoders which seem to be stuck are not exchanged with others, which looks like that, too.
+
+    Raises:
+        IdentificationError: as `check_encoder_travels`.
+    """
+    heard = [serial for serial in serials if serial in recording.modules]
+    try:
+        clocks = map_clocks({s: recording.modules[s].trips for s in heard})
+        check_encoder_travels(encoder_travels(recording, clocks, heard))
+    except DataError as error:
+        raise IdentificationError.of(error) from error
 
 
 def _same_motions(so_far: Recording, recording: Recording) -> bool:
@@ -174,6 +234,12 @@ def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
     Raises:
         IdentificationError: later motions have too few samples.
     """
+    later_findings = [
+        finding
+        for finding in sensor_findings(recording, _explored(recording))
+        if (finding.serial, finding.kind) not in {(f.serial, f.kind) for f in kept.findings}
+    ]
+    recording = recording.without(kept.excluded) if kept.excluded else recording
     try:
         everyone = _explored(recording)
         clocks = map_clocks({s: recording.modules[s].trips for s in everyone})
@@ -184,9 +250,16 @@ def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
             *recording.damage,
             *sampling_notes(recording, clocks, everyone, later, REFINEMENT_CUTOFF_HZ),
         )
-    except (DataError, np.linalg.LinAlgError) as error:
+    except DataError as error:
         raise IdentificationError.of(error) from error
-    return kept._replace(clocks=clocks, notes=tuple(dict.fromkeys((*kept.notes, *sampling))))
+    except np.linalg.LinAlgError as error:
+        raise IdentificationError(f"{_NO_SOLUTION} ({error})") from error
+    return kept._replace(
+        clocks=clocks,
+        notes=tuple(dict.fromkeys((*kept.notes, *sampling))),
+        findings=(*kept.findings, *later_findings),
+        damage=tuple(recording.damage),
+    )
 
 
 def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInformation]) -> Kinematics:
@@ -237,8 +310,10 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
             *doubted,
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
         )
-    except (DataError, np.linalg.LinAlgError) as error:
+    except DataError as error:
         raise IdentificationError.of(error) from error
+    except np.linalg.LinAlgError as error:
+        raise IdentificationError(f"{_NO_SOLUTION} ({error})") from error
     notes = tuple(
         f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"
         # Copies: during a session late estimates still arrive.

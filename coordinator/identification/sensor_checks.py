@@ -30,6 +30,8 @@ DIRECTION_SIGMA_RAD = 0.05
 NAMED_ABOVE = 4.0
 # Beyond this a sensor is sick beyond doubt: what models lack is a few sigmas, too.
 SERIOUS_ABOVE = 8.0
+# Readings that vary by less do not vary: single precision.
+EXACT = 1e-6
 # A joint that was moved alone travels at least this far, and any other less than the share of it.
 TRAVEL_RAD, HELD_SHARE = 0.05, 0.3
 
@@ -279,6 +281,8 @@ def doubted_sensors(
 def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[Finding]:
     """Return the IMUs whose residuals are far beyond their noise, each by the motion where they are most so.
 
+    An axis that reads the same all the time, where the model has it vary, is stuck.
+
     Args:
         refined: n modules by k motions.
         noise: (2, k, n) of gyro and accelerometer, rms per axis.
@@ -292,8 +296,13 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
             what, unit = _SENSORS[sensor]
             off = (measured - expected) / expected
             kind: Sickness = "accelerometer_contradicts" if sensor else "gyro_contradicts"
+            wrong, spread = refined.columns[sensor, :, :, k]
+            still = (spread < EXACT).all(axis=0)
+            stuck = bool((still & (wrong > SYSTEMATIC * noise[sensor, :, k, None]).any(axis=0)).any())
             findings.append(
-                Finding(serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED, kind)
+                Finding(
+                    serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED, kind, stuck
+                )
             )
     return findings
 

@@ -8,7 +8,7 @@ import copy
 import hashlib
 import struct
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -128,6 +128,7 @@ class Recording:
 
     explored: what had been recorded at the journal's `explored` event; None before it, and in older
     recordings, which do not have it. damage: sentences on places of a file that could not be read.
+    not_finite: by serial, how many messages with values that are no numbers were refused.
     """
 
     def __init__(self) -> None:
@@ -138,6 +139,7 @@ class Recording:
         self.explored: Recording | None = None
         self.questions: dict[bytes, InformationRequest] = {}
         self.refused: dict[str, int] = {}
+        self.not_finite: dict[str, int] = {}
         self.damage: list[str] = []
         self._hash = hashlib.sha256()
         self._sent: dict[tuple[str, int], int] = {}
@@ -173,7 +175,13 @@ class Recording:
             return event
         head = f"{entry.kind} {entry.topic} {len(entry.payload)} ".encode()
         self._hash.update(head + struct.pack("<q", entry.t_ns) + entry.payload)
-        return self._counted(self._index, entry, entry.kind)
+        try:
+            return self._counted(self._index, entry, entry.kind)
+        except WireError as error:
+            if error.reason is Refusal.NOT_FINITE:
+                serial = parse(entry.topic).serial
+                self.not_finite[serial] = self.not_finite.get(serial, 0) + 1
+            raise
 
     def _counted(self, read: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
         """Return what is read; count it by reason where it is refused."""
@@ -198,8 +206,29 @@ class Recording:
         so_far.past = {(serial, module.boot): module for serial, module in so_far.modules.items()}
         so_far.estimates = {pair: dict(estimates) for pair, estimates in self.estimates.items()}
         so_far.journal = list(self.journal)
+        so_far.not_finite, so_far.damage = dict(self.not_finite), list(self.damage)
         so_far._hash = self._hash.copy()
         return so_far
+
+    def without(self, serials: Collection[str]) -> "Recording":
+        """Return the recording of the robot without some modules, whose joints stand still.
+
+        Motions of several joints at once are not part of it, as these joints moved along. It is for reading.
+        """
+        rest = self._so_far()
+        rest.explored = None
+        rest.modules = {s: module for s, module in rest.modules.items() if s not in serials}
+        rest.past = {key: module for key, module in rest.past.items() if key[0] not in serials}
+        rest.estimates = {
+            pair: estimates for pair, estimates in rest.estimates.items() if not set(pair) & set(serials)
+        }
+        together = ("whole", "dynamic", "held_out")
+        rest.journal = [
+            event
+            for event in rest.journal
+            if event.what != "motion" or (event.serial not in serials and event.purpose not in together)
+        ]
+        return rest
 
     def _index(self, entry: Entry, exchange: Exchange) -> Message:
         parts = parse(entry.topic)

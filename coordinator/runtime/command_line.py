@@ -5,7 +5,7 @@ import dataclasses
 import inspect
 import logging
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from module_agent.model.errors import EXIT_CODES, EXIT_INTERRUPTED, RobotError, UsageError
+from module_agent.model.errors import EXIT_CODES, EXIT_INTERRUPTED, EXIT_SUSPECT, RobotError, UsageError
 from module_agent.model.settings import LOG_LEVELS, SETTINGS, read_settings, variable
 from module_agent.model.suggestion import did_you_mean
 from module_agent.model.version import installed_version
@@ -37,6 +37,12 @@ class CommandFailed(RobotError):
 def fail(text: object, exit_code: int) -> NoReturn:
     """End the command with a sentence on standard error and an exit code."""
     raise CommandFailed(str(text), exit_code)
+
+
+def end_if_suspect(suspicions: Sequence[str]) -> None:
+    """End the command with `EXIT_SUSPECT` if a result is not to be believed as usual, and say why."""
+    if suspicions:
+        fail(f"the result is not to be believed as usual: {'; '.join(suspicions)}", EXIT_SUSPECT)
 
 
 def ending(error: BaseException) -> RobotError:

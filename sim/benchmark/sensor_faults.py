@@ -4,9 +4,9 @@ A session of a healthy robot is recorded, and then what one module sends is alte
 the robot itself are altered before.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,26 @@ from module_agent.model.catalogue import CATALOGUE, ModuleType
 from module_agent.model.chain import Chain
 from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network
-from module_agent.wire.codec import decode, encode
-from module_agent.wire.feedback_rows import ROW, Rows
-from module_agent.wire.keys import Leaf, parse
-from module_agent.wire.messages import Feedback, Info, Message
+from module_agent.wire.messages import Message
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.cases.arm import KNOWN, SHORTENED, arm_plan
 from sim.benchmark.row import Row, count, coverage
+from sim.benchmark.sick_recordings import (
+    COMMANDS,
+    POSITION,
+    Alteration,
+    dead,
+    exchanged,
+    jumped,
+    leaping_clock,
+    mislabelled,
+    multiplied,
+    not_a_number,
+    saturated,
+    silent,
+    stuck,
+    with_hole,
+)
 from sim.imperfections.noise_profile import noise_profile
 from sim.robot.robot_file import Flex, Robot, load_robot
 from sim.robot.robot_tree import true_chain
@@ -36,11 +49,9 @@ from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
 ROBOT, NOISE = "a2085_03", "x5"
-# A type whose IMU is 55 mm away from that of the module's own.
-OTHER_TYPE = "X5-9-old"
 SCALE = 1.01
-# Rows that are lost in one piece: an eighth of a second.
-LOST_ROWS = 32
+# A sensor's range as a share of its largest reading; a jump of an encoder, of 3 deg.
+CLIPPED, JUMP_RAD = 0.6, 0.05
 # Beyond this is one interval in a thousand by chance.
 WRONG_ABOVE = 3.29
 # Damping of links of 1 Nm/rad; it grows with the root of the stiffness. 2 % of the critical one at 5 Hz and
@@ -49,8 +60,6 @@ _DAMPING = 0.013
 _COST_S, _SMALL_COST_S = 15.0, 2.0
 # As many intervals make a row of their own: of fewer, one that does not cover would be a miss.
 _OWN_COVERAGE = 20
-_POSITION = ("position_rad", "velocity_rad_s")
-_COMMANDS = ("position_command_rad", "velocity_command_rad_s")
 
 
 class FaultTrial(NamedTuple):
@@ -69,9 +78,6 @@ class FaultTrial(NamedTuple):
     def silent(self) -> bool:
         """Whether a link is wrong and nothing is named."""
         return not self.named and max(self.sigmas_off, default=np.inf) > WRONG_ABOVE
-
-
-Alteration = Callable[[list[Entry], tuple[str, ...], int], list[Entry]]
 
 
 class Fault(NamedTuple):
@@ -138,7 +144,12 @@ def _sigmas_off(robot: Robot, kinematics: Kinematics, recording: Recording) -> t
     reported = {serial: recording.module_type(serial) for serial in fit.chain.serials}
     built = {module.serial: CATALOGUE[module.type] for module in robot.modules}
     chain = relabelled(fit.chain, reported, built)
-    for child in [child for child, parent in enumerate(truth.parent) if parent >= 0]:
+    # Of a robot without a module the links of the others to each other count.
+    for child in [
+        child
+        for child, parent in enumerate(truth.parent)
+        if parent >= 0 and not {truth.serials[child], truth.serials[parent]} & set(kinematics.excluded)
+    ]:
         errors = link_errors(chain, truth, child)
         own = fit.chain.serials.index(truth.serials[child])
         off.append(np.inf if errors is None else abs(errors.length_m) / float(fit.link_length_sigma_m[own]))
@@ -176,86 +187,35 @@ def _altered(recording: _Kept, fault: Fault, ill: tuple[str, ...]) -> Recording:
     return altered
 
 
-def _rows(entry: Entry) -> tuple[Feedback, Rows] | None:
-    """Return a feedback message and a copy of its rows; None of any other entry."""
-    if entry.kind in ("journal", "request") or parse(entry.topic).leaf is not Leaf.FEEDBACK:
-        return None
-    message = decode(Feedback, entry.payload)
-    return message, np.frombuffer(message.rows, ROW).copy()
-
-
-def _with_rows(entry: Entry, message: Feedback, rows: Rows) -> Entry:
-    return entry._replace(payload=encode(message.model_copy(update={"rows": rows.tobytes()})))
-
-
-def _multiplied(
-    fields: Sequence[str], factor: float, entries: list[Entry], ill: tuple[str, ...], _: int
-) -> list[Entry]:
-    altered = []
-    for entry in entries:
-        sent = _rows(entry)
-        if sent is not None and sent[0].serial in ill:
-            for field in fields:
-                sent[1][field] *= factor
-            entry = _with_rows(entry, *sent)
-        altered.append(entry)
-    return altered
-
-
-def _swapped(entries: list[Entry], ill: tuple[str, ...], _: int) -> list[Entry]:
-    other = dict(zip(ill, reversed(ill), strict=True))
-    sent = [_rows(entry) for entry in entries]
-    tracks = {
-        (m.serial, m.first_row + n): row for m, rows in filter(None, sent) for n, row in enumerate(rows)
-    }
-    altered = []
-    for entry, one in zip(entries, sent, strict=True):
-        if one is not None and one[0].serial in ill:
-            message, rows = one[0], one[1].copy()
-            for n in range(len(rows)):
-                row: Any = tracks.get((other[message.serial], message.first_row + n))
-                if row is not None:
-                    for field in _POSITION:
-                        rows[field][n] = row[field]
-            entry = _with_rows(entry, message, rows)
-        altered.append(entry)
-    return altered
-
-
-def _mislabelled(entries: list[Entry], ill: tuple[str, ...], _: int) -> list[Entry]:
-    altered = []
-    for entry in entries:
-        if entry.kind not in ("journal", "request") and parse(entry.topic)[1:] == (ill[0], Leaf.INFO):
-            info = decode(Info, entry.payload).model_copy(update={"module_type": OTHER_TYPE})
-            entry = entry._replace(payload=encode(info))
-        altered.append(entry)
-    return altered
-
-
-def _with_hole(entries: list[Entry], ill: tuple[str, ...], middle: int) -> list[Entry]:
-    lost = range(middle, middle + LOST_ROWS)
-    sent = [(entry, _rows(entry)) for entry in entries]
-    return [
-        entry
-        for entry, one in sent
-        if one is None
-        or one[0].serial not in ill
-        or not any(one[0].first_row + n in lost for n in range(len(one[1])))
-    ]
-
-
 FAULTS: Mapping[str, Fault] = {
     "none": Fault(),
-    "a mislabelled type": Fault(alter=_mislabelled, concerns=1),
-    "two encoders exchanged": Fault(alter=_swapped, concerns=2),
-    "an encoder against its command": Fault(alter=partial(_multiplied, _POSITION, -1.0), concerns=1),
+    "a mislabelled type": Fault(alter=mislabelled, concerns=1),
+    "two encoders exchanged": Fault(alter=exchanged, concerns=2),
+    "an encoder against its command": Fault(alter=multiplied(POSITION, -1.0), concerns=1),
     "an encoder and commands of the wrong sign": Fault(
-        alter=partial(_multiplied, (*_POSITION, *_COMMANDS), -1.0), concerns=1
+        alter=multiplied((*POSITION, *COMMANDS), -1.0), concerns=1
     ),
-    "an encoder 1 % off in scale": Fault(alter=partial(_multiplied, _POSITION, SCALE), concerns=1),
+    "an encoder 1 % off in scale": Fault(alter=multiplied(POSITION, SCALE), concerns=1),
     **{f"links of {k} Nm/rad": Fault(stiffness_nm_rad=float(k)) for k in (100, 200, 400, 1000, 2000)},
     **{f"IMUs at {rate} Hz": Fault(imu_rate_hz=float(rate)) for rate in (50, 100, 500, 1000)},
-    "a hole in a motion": Fault(alter=_with_hole, concerns=1),
+    "a hole in a motion": Fault(alter=with_hole, concerns=1),
+    **{
+        f"a dead axis {'xyz'[axis]} of {name}": Fault(alter=dead(field, [axis]), concerns=1)
+        for name, field in (("an accelerometer", "accel_m_s2"), ("a gyro", "gyro_rad_s"))
+        for axis in range(3)
+    },
+    "a stuck IMU": Fault(alter=stuck("gyro_rad_s", "accel_m_s2"), concerns=1),
+    "a saturated gyro": Fault(alter=saturated("gyro_rad_s", CLIPPED), concerns=1),
+    "a saturated accelerometer": Fault(alter=saturated("accel_m_s2", CLIPPED), concerns=1),
+    "a gyro 5 % off in scale": Fault(alter=multiplied(("gyro_rad_s",), 1.05), concerns=1),
+    "an accelerometer 5 % off in scale": Fault(alter=multiplied(("accel_m_s2",), 1.05), concerns=1),
+    "a stuck encoder": Fault(alter=stuck(*POSITION), concerns=1),
+    "an encoder that jumps": Fault(alter=jumped("position_rad", JUMP_RAD), concerns=1),
+    "a stuck torque sensor": Fault(alter=stuck("effort_nm"), concerns=1),
+    "a clock that leaps ahead": Fault(alter=leaping_clock(500_000_000), concerns=1),
+    "a clock that goes back": Fault(alter=leaping_clock(-300_000_000), concerns=1),
+    "readings that are no numbers": Fault(alter=not_a_number("gyro_rad_s"), concerns=1),
+    "a module without messages": Fault(alter=silent, concerns=1),
 }
 # Without a fault, and with one that does not hide the links: nothing may be named.
 HARMLESS = tuple(name for name in FAULTS if name in ("none", "a hole in a motion") or "IMUs" in name)

@@ -11,12 +11,12 @@ import typer
 
 from coordinator.commands.options import PlanOptions, Quiet
 from coordinator.live_robot.authority import make_credentials
-from coordinator.recording.run_folder import REPORT
-from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
+from coordinator.recording.run_folder import REPORT, RESULT
+from coordinator.runtime.command_line import ENDINGS, end_if_suspect, ending, fail, with_options
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
 from coordinator.runtime.terminal import Terminal
 from coordinator.viewer.targets import NATIVE_PORT, proxy_url, viewer_choice
-from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
+from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_SUSPECT
 from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import score_run
 from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError, default_processes
@@ -59,9 +59,10 @@ def run(
         report=launched.report,
         safety=launched.limits_of(robot),
     )
-    _run_virtual(config, quiet)
+    suspicions = _run_virtual(config, quiet)
     score_run(config.out)
     _print_report(config.out)
+    end_if_suspect(suspicions)
 
 
 @with_options
@@ -116,13 +117,18 @@ def _launch(
     )
     if config.secure is not None:
         make_credentials(config.secure, robot.name, robot.serials, [s for s in config.shares if len(s) > 1])
-    _run_processes(config)
+    code = _run_processes(config)
     add_truth(config.out, viewer, _note)
     score_run(config.out)
     _print_report(config.out)
+    if code:
+        # The coordinator has said why.
+        raise typer.Exit(code)
 
 
-def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
+def _run_virtual(config: VirtualConfig, quiet: bool) -> list[str]:
+    """Run in virtual time; return why the result is not to be believed as usual, if there is anything."""
+
     def on_signal(interruption: Interruption) -> None:
         def stop(_number: int, _frame: FrameType | None) -> None:
             ignore_signals()
@@ -145,6 +151,7 @@ def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
     typer.echo(
         f"{result.robot_time_s:.1f} s of robot time in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x"
     )
+    return result.suspicions
 
 
 def _print_report(out: Path) -> None:
@@ -152,7 +159,9 @@ def _print_report(out: Path) -> None:
         typer.echo(f"report: {out / REPORT}")
 
 
-def _run_processes(config: LaunchConfig) -> None:
+def _run_processes(config: LaunchConfig) -> int:
+    """Run all processes; return 0, or `EXIT_SUSPECT` if there is a result in spite of sick sensors."""
+
     def stop(number: int, _frame: FrameType | None) -> None:
         # Once: everything is then stopped in order, and a second signal would leave some of it behind.
         ignore_signals()
@@ -168,5 +177,7 @@ def _run_processes(config: LaunchConfig) -> None:
             code = launcher.watch(launcher.start_coordinator())
     except LaunchError as error:
         fail(f"{error}; logs: {config.out / LOGS}", EXIT_FAILED)
-    if code:
+    suspect = code == EXIT_SUSPECT and (config.out / RESULT).is_file()
+    if code and not suspect:
         fail(f"the coordinator ended with {code}; logs of the others: {config.out / LOGS}", code)
+    return code

@@ -46,7 +46,8 @@ def _altered(entries: list[Entry], alter: Alteration) -> Recording:
     """The recording with the rows of every feedback as `alter(serial, first row, rows)` leaves them."""
     recording = Recording()
     for entry in entries:
-        if entry.kind != "journal" and entry.kind != "request" and parse(entry.topic).leaf is Leaf.FEEDBACK:
+        leaf = None if entry.kind in ("journal", "request") else parse(entry.topic).leaf
+        if leaf in (Leaf.FEEDBACK, Leaf.HISTORY):
             message = decode(Feedback, entry.payload)
             rows = np.frombuffer(message.rows, ROW).copy()
             alter(message.serial, message.first_row, rows)

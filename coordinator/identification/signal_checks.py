@@ -1,0 +1,318 @@
+"""Dead, stuck, saturated and jumping sensors, found in the samples of each column before anything is fitted.
+
+What noise and motion must change, but does not, is stuck; a reading that stays at its extreme is saturated; a
+position that jumps between two samples, and a clock that leaps while that of the session goes on, are so
+without any model of the robot.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.identification.finding import UNUSABLE, Finding, Sickness
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import ModuleRecord, Recording, RoundTrip
+from module_agent.model.catalogue import GRAVITY_M_S2
+from module_agent.model.chain import Array
+from module_agent.model.imu_prior import ACCEL_BIAS_SIGMA_M_S2
+from module_agent.signals.filtering import NS_PER_S
+from module_agent.wire.feedback_rows import Rows
+
+# A column that reads the same for this long, and for as many samples, although there is noise. Of a real
+# X5-1's gyro two readings in a row are alike for every second sample: 60 in a row once in 1e18.
+STUCK_S, STUCK_SAMPLES = 0.4, 60
+# Noise of a sample [rad/s, m/s^2] above which readings are not exact: a sixth of what a real X5-1's log has.
+NOISY = (1e-4, 1.5e-3)
+# A sensor at the end of its range reads the same extreme this often in a row, this many of its noise's
+# standard deviations away from its median.
+CLIPPED_SAMPLES, CLIPPED_SIGMAS = 8, 30.0
+# A joint turns by this much while its encoder or effort is said to be stuck.
+TURNED_RAD = 0.05
+# A position that changes by this much from one sample to the next, and neither before nor after it.
+JUMP_RAD = 0.02
+# Clocks of crystals, and some more; the least leap; steps between rows of this many usual ones are long.
+CRYSTAL, LEAP_NS, LONG_TICKS = 3e-4, 10_000_000, 3.0
+# The specific force at rest is that of gravity within this share, many times what any accelerometer is off.
+GRAVITY_SHARE = 0.25
+_IMU: tuple[tuple[str, str, float, Sickness, Sickness], ...] = (
+    ("gyro_rad_s", "rad/s", NOISY[0], "gyro_stuck", "gyro_saturated"),
+    ("accel_m_s2", "m/s^2", NOISY[1], "accelerometer_stuck", "accelerometer_saturated"),
+)
+_NAMES = {"gyro_rad_s": "its gyro", "accel_m_s2": "its accelerometer"}
+WHOLE = "the recording"
+
+
+class Run(NamedTuple):
+    """Samples `start` up to and without `end` that are all alike."""
+
+    start: int
+    end: int
+
+    @property
+    def length(self) -> int:
+        """How many samples these are."""
+        return self.end - self.start
+
+
+def runs(values: Array, longest: int = 1) -> list[Run]:
+    """Return the stretches of values (m,) of at least `longest` samples in which no one differs."""
+    changed = np.flatnonzero(values[1:] != values[:-1]) + 1
+    edges = np.concatenate([[0], changed, [len(values)]])
+    long = np.flatnonzero(np.diff(edges) >= longest)
+    return [Run(int(edges[k]), int(edges[k + 1])) for k in long]
+
+
+def sample_noise(values: Array) -> Array:
+    """Return the standard deviation of the noise of single samples (m, ...), by third differences.
+
+    A smooth motion hardly shows in them, and a stretch that is stuck not at all, as it is the upper quartile.
+    """
+    if len(values) < 8:
+        return np.zeros(values.shape[1:])
+    third = np.abs(np.diff(values, n=3, axis=0))
+    # The upper quartile of |N(0, 20 sigma^2)| is 1.15 sigma sqrt(20).
+    return np.asarray(np.quantile(third, 0.75, axis=0) / (1.15 * 20.0**0.5))
+
+
+def sensor_findings(recording: Recording, serials: Sequence[str]) -> tuple[Finding, ...]:
+    """Return the modules of a recording whose sensors or clocks are sick whatever the robot is like."""
+    silent = [s for s in serials if s not in recording.modules or not len(_all_rows(recording.modules[s]))]
+    heard = [s for s in serials if s not in silent]
+    rows = {s: _all_rows(recording.modules[s]) for s in heard}
+    events = [e for e in recording.latest_motions("constant", "windowed_sine", "whole") if e.serial in heard]
+    return (
+        *(_silent(s) for s in silent),
+        *_inertial(rows, {s: recording.rest_rows(s) for s in heard}),
+        *(one for s in heard for one in _gravity(s, recording.rest_rows(s)["accel_m_s2"].astype(float))),
+        *(one for s in heard for one in _joint(s, [e for e in events if e.serial == s], recording)),
+        *(one for s in heard for one in _jumps(s, rows[s])),
+        *_clocks(recording, rows),
+        *_not_finite(recording, serials),
+    )
+
+
+def unusable(findings: Iterable[Finding]) -> tuple[str, ...]:
+    """Return the serials of modules nothing of which can be used for the chain, sorted."""
+    return tuple(sorted({f.serial for f in findings if f.serious and f.kind in UNUSABLE}))
+
+
+def _all_rows(module: ModuleRecord) -> Rows:
+    return module.rows.rows(module.rows.first_row, module.rows.end_row)
+
+
+def _silent(serial: str) -> Finding:
+    remedy = "the recording is damaged, or the module never sent any"
+    return Finding(
+        serial, WHOLE, "the number of its rows", 0.0, 1.0, np.inf, "", remedy, "messages_missing", True
+    )
+
+
+def _inertial(rows: dict[str, Rows], rests: dict[str, Rows]) -> Iterable[Finding]:
+    """Yield stuck and saturated axes of IMUs, if readings at rest have noise, so that equal ones tell."""
+    fresh = {s: one[np.unique(one["imu_t_ns"], return_index=True)[1]] for s, one in rows.items()}
+    for field, unit, noisy, stuck_kind, saturated_kind in _IMU:
+        noise = {s: sample_noise(one[field].astype(float)) for s, one in fresh.items()}
+        resting = [sample_noise(one[field].astype(float)) > noisy for one in rests.values()]
+        if not resting or np.mean(resting) < 1.0 / 3.0:
+            continue
+        for serial, one in fresh.items():
+            step_s = _step_s(one["imu_t_ns"])
+            least = max(STUCK_SAMPLES, round(STUCK_S / step_s) if step_s else STUCK_SAMPLES)
+            for axis in range(3):
+                values = one[field][:, axis].astype(float)
+                what = f"{_NAMES[field]} along {'xyz'[axis]}"
+                least_noise = max(float(noise[serial][axis]), noisy)
+                clipped = _clipped(values, least_noise)
+                stuck = max(runs(values, least), key=lambda run: run.length, default=None)
+                if clipped is not None:
+                    yield _at_the_end(serial, what, clipped, values, least_noise, unit, saturated_kind)
+                elif stuck is not None:
+                    yield _same_for(serial, what, stuck, step_s, stuck_kind)
+
+
+def _at_the_end(
+    serial: str, what: str, clipped: float, values: Array, noise: float, unit: str, kind: Sickness
+) -> Finding:
+    """Return the finding of a column that stays at an extreme."""
+    middle, remedy = float(np.median(values)), "the sensor is at the end of its range"
+    text, away = f"the largest reading of {what}, again and again,", abs(clipped - middle) / noise
+    return Finding(serial, WHOLE, text, clipped, middle, away, unit, remedy, kind, True)
+
+
+def _gravity(serial: str, accel_m_s2: Array) -> Iterable[Finding]:
+    """Yield an accelerometer that does not read gravity at rest (m, 3)."""
+    if not len(accel_m_s2):
+        return
+    force = float(np.linalg.norm(np.median(accel_m_s2, axis=0)))
+    if abs(force - GRAVITY_M_S2) > GRAVITY_SHARE * GRAVITY_M_S2:
+        yield Finding(
+            serial,
+            "its rest",
+            "the specific force",
+            force,
+            GRAVITY_M_S2,
+            abs(force - GRAVITY_M_S2) / ACCEL_BIAS_SIGMA_M_S2,
+            "m/s^2",
+            "an axis of the accelerometer is dead, or saturated",
+            "accelerometer_contradicts",
+            True,
+        )
+
+
+def _same_for(serial: str, what: str, run: Run, step_s: float, kind: Sickness) -> Finding:
+    """Return the finding of a column that reads the same for a while, in which noise alone changes it."""
+    text = f"the time for which {what} reads exactly the same"
+    remedy = "the sensor is dead or stuck"
+    return Finding(
+        serial, WHOLE, text, run.length * step_s, step_s, float(run.length), "s", remedy, kind, True
+    )
+
+
+def _clipped(values: Array, noise: float) -> float | None:
+    """Return the extreme at which values (m,) stay, far away from their median; None if they do not."""
+    middle = float(np.median(values))
+    for extreme in (float(values.max()), float(values.min())):
+        at = values == extreme
+        if abs(extreme - middle) > CLIPPED_SIGMAS * noise and np.count_nonzero(at) >= CLIPPED_SAMPLES:
+            longest = max((run.length for run in runs(at.astype(float)) if at[run.start]), default=0)
+            if longest >= CLIPPED_SAMPLES:
+                return extreme
+    return None
+
+
+def _step_s(t_ns: NDArray[np.int64]) -> float:
+    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
+
+
+def _joint(serial: str, events: Sequence[JournalEvent], recording: Recording) -> Iterable[Finding]:
+    """Yield an encoder and an effort that stay while the joint's motor turns, in the joint's own motions."""
+    gear_ratio = recording.module_type(serial).gear_ratio if recording.modules[serial].info else np.inf
+    found: set[Sickness] = set()
+    for event in events:
+        if event.motion is None or event.motion.end_row is None:
+            continue
+        rows = recording.rows(serial, event.motion.start_row, event.motion.end_row)
+        step_s = _step_s(rows["t_ns"].astype(np.int64))
+        motor = np.cumsum(rows["motor_velocity_rad_s"].astype(float)) * step_s / gear_ratio
+        turned_by: tuple[tuple[str, str, Array, Sickness], ...] = (
+            ("position_rad", "its encoder", motor, "encoder_stuck"),
+            ("effort_nm", "its effort", rows["position_rad"], "effort_stuck"),
+        )
+        for field, name, turned, kind in turned_by:
+            stuck = [
+                run
+                for run in runs(rows[field], STUCK_SAMPLES)
+                if np.isfinite(turned).all() and np.ptp(turned[run.start : run.end]) > TURNED_RAD
+            ]
+            if stuck and kind not in found:
+                found.add(kind)
+                yield Finding(
+                    serial,
+                    f"its {event.purpose} motion",
+                    f"the time for which {name} reads exactly the same while the joint turns",
+                    stuck[0].length * step_s,
+                    step_s,
+                    float(stuck[0].length),
+                    "s",
+                    "the sensor is dead or stuck",
+                    kind,
+                    True,
+                )
+
+
+def _jumps(serial: str, rows: Rows) -> Iterable[Finding]:
+    """Yield the largest jump of an encoder between two samples, if it is slower before and after."""
+    q, t_ns = rows["position_rad"], rows["t_ns"].astype(np.int64)
+    if len(q) < 4:
+        return
+    step, gap = np.diff(q), np.diff(t_ns)
+    apart = np.minimum(np.abs(step[1:-1] - step[:-2]), np.abs(step[1:-1] - step[2:]))
+    # A step that is slower or faster than the one before and the one after; a hole in the rows is none.
+    alone = (step[1:-1] - step[:-2]) * (step[1:-1] - step[2:]) > 0.0
+    whole = np.abs(gap[1:-1]) < LONG_TICKS * np.median(gap)
+    size = np.where(alone & whole, apart, 0.0)
+    worst = int(size.argmax())
+    if size[worst] > JUMP_RAD:
+        turned, usual = float(step[1 + worst]), float(np.median(np.abs(step)))
+        yield Finding(
+            serial,
+            WHOLE,
+            "a turn of its encoder between two samples",
+            turned,
+            usual,
+            abs(turned) / JUMP_RAD,
+            "rad",
+            "its encoder jumped, and its positions before and after do not belong together",
+            "encoder_jump",
+            True,
+        )
+
+
+def _clocks(recording: Recording, rows: dict[str, Rows]) -> Iterable[Finding]:
+    """Yield the clocks that went back, or leapt while round trips show that the session's did not.
+
+    An agent that was held up leaves as large a hole between two rows, but its clock agrees with the session's
+    as before; a simulated world that catches up makes all modules early.
+    """
+    for serial, own in rows.items():
+        t_ns = own["t_ns"].astype(np.int64)
+        gap = np.diff(t_ns)
+        if not len(gap):
+            continue
+        usual = float(np.median(gap))
+        back, leap = int(gap.argmin()), int(gap.argmax())
+        at = None
+        if gap[back] < 0:
+            at = back
+        elif gap[leap] > LEAP_NS + LONG_TICKS * usual and _leapt(recording, serial, int(t_ns[leap])):
+            at = leap
+        if at is not None:
+            yield Finding(
+                serial,
+                WHOLE,
+                "a step of its clock between two rows",
+                float(gap[at]) / NS_PER_S,
+                usual / NS_PER_S,
+                abs(float(gap[at]) - usual) / LEAP_NS,
+                "s",
+                "its clock jumped, and its samples before and after do not belong together",
+                "clock_jump",
+                True,
+            )
+
+
+def _leapt(recording: Recording, serial: str, module_ns: int) -> bool:
+    """Return whether a module's clock, and not those of all modules, is early after one of its instants."""
+    trips = recording.modules[serial].round_trips
+    before = [trip.received_ns for trip in trips if trip.module_ns <= module_ns]
+    if not before:
+        return False
+    others = [module.round_trips for s, module in recording.modules.items() if s != serial]
+    early = [_early_after(other, max(before)) for other in others]
+    return _early_after(trips, max(before)) and not (early and all(early))
+
+
+def _early_after(trips: Sequence[RoundTrip], session_ns: int) -> bool:
+    """Return whether a module's clock is ahead of the session's after an instant, compared with before.
+
+    A round trip bounds by how much the session's time exceeds the module's, from both sides.
+    """
+    before = [trip.sent_ns - trip.module_ns for trip in trips if trip.received_ns <= session_ns]
+    after = [trip.received_ns - trip.module_ns for trip in trips if trip.sent_ns >= session_ns]
+    if not before or not after:
+        return False
+    drift_ns = CRYSTAL * (trips[-1].received_ns - trips[0].sent_ns)
+    return min(after) < max(before) - LEAP_NS - drift_ns
+
+
+def _not_finite(recording: Recording, serials: Sequence[str]) -> Iterable[Finding]:
+    """Yield the modules that sent values that are no numbers: such messages are excluded whole."""
+    for serial in serials:
+        count = recording.not_finite.get(serial, 0)
+        if count:
+            text, remedy = "the number of its messages with values that are no numbers", "they are excluded"
+            yield Finding(
+                serial, WHOLE, text, float(count), 0.0, float(count), "", remedy, "not_finite", True
+            )

@@ -1,0 +1,101 @@
+"""Sick columns are found in the samples alone; exact sensors, joints at rest and late agents are not sick."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.identification.signal_checks import (
+    _clipped,
+    _early_after,
+    _inertial,
+    _jumps,
+    runs,
+    sample_noise,
+)
+from coordinator.recording.recording import RoundTrip
+from module_agent.model.chain import Array
+from module_agent.wire.feedback_rows import ROW, Rows
+
+TICK_NS, STEP = 4_000_000, 1.06e-3
+
+
+def rows(count: int = 2000, noise: float = 6e-4, seed: int = 1) -> Rows:
+    """A module at 250 Hz that lies still for a second and then swings; the gyro has steps as real ones do."""
+    draw, made = np.random.default_rng(seed), np.zeros(count, ROW)
+    made["t_ns"] = made["imu_t_ns"] = TICK_NS * np.arange(count)
+    swing = np.clip(np.arange(count) - 250, 0, None) * 4e-3
+    made["position_rad"] = np.round(0.3 * np.sin(2.0 * swing) / 1e-4) * 1e-4
+    gyro = 0.6 * np.cos(2.0 * swing)[:, None] * [0.0, 0.2, 1.0] * (swing > 0.0)[:, None]
+    made["gyro_rad_s"] = np.round((gyro + noise * draw.standard_normal((count, 3))) / STEP) * STEP
+    made["accel_m_s2"] = [0.0, 0.0, 9.8] + 20.0 * noise * draw.standard_normal((count, 3))
+    return made
+
+
+def kinds(found: dict[str, Rows]) -> list[tuple[str, str, bool]]:
+    rests = {serial: one[:250] for serial, one in found.items()}
+    return [(one.serial, one.kind, one.serious) for one in _inertial(found, rests)]
+
+
+def test_healthy_imus_with_steps_as_coarse_as_their_noise_are_not_stuck() -> None:
+    assert kinds({f"M-{seed}": rows(20_000, seed=seed) for seed in range(4)}) == []
+
+
+@pytest.mark.parametrize(("field", "kind"), [("gyro_rad_s", "gyro"), ("accel_m_s2", "accelerometer")])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("since", [0, 900])
+def test_one_dead_or_stuck_axis_is_named(field: str, kind: str, axis: int, since: int) -> None:
+    sick = rows()
+    sick[field][since:, axis] = sick[field][since, axis]
+    assert kinds({"A": rows(seed=2), "B": sick}) == [("B", f"{kind}_stuck", True)]
+
+
+def test_exact_sensors_that_lie_still_are_not_stuck() -> None:
+    # A simulated robot without noise: a base that is truly still, and one module that swings.
+    still = rows(noise=0.0)
+    still["gyro_rad_s"] = 0.0
+    assert kinds({"base": still, "B": rows(noise=0.0)}) == []
+
+
+def test_a_reading_that_stays_at_the_end_of_its_range_is_saturated() -> None:
+    sick = rows()
+    sick["gyro_rad_s"] = np.clip(sick["gyro_rad_s"], -0.4, 0.4)
+    assert kinds({"A": rows(seed=2), "B": sick}) == [("B", "gyro_saturated", True)]
+    # The top of a swing is no end: few samples in a row are alike there.
+    assert _clipped(rows()["gyro_rad_s"][:, 2].astype(float), 6e-4) is None
+
+
+def test_a_jump_of_an_encoder_is_named_and_a_hole_in_its_rows_is_not() -> None:
+    jumped, with_hole = rows(), np.delete(rows(), slice(700, 800))
+    jumped["position_rad"][1000:] += 0.05
+    assert [one.kind for one in _jumps("A", jumped)] == ["encoder_jump"]
+    assert [list(_jumps("A", one)) for one in (rows(), with_hole)] == [[], []]
+
+
+def trips(offset_ns: Any, seconds: int = 20) -> list[RoundTrip]:
+    """Twice a second; the session's clock exceeds the module's by `offset_ns(session time)`."""
+    at = [500_000_000 * k for k in range(2 * seconds)]
+    return [RoundTrip(t, t + 2_000_000, t + 1_000_000 - int(offset_ns(t))) for t in at]
+
+
+def test_a_clock_that_leaps_is_told_from_an_agent_that_is_late_and_a_crystal_that_drifts() -> None:
+    middle = 10_000_000_000
+    assert _early_after(trips(lambda t: -50e6 if t > middle else 0.0), middle)
+    assert not _early_after(trips(lambda t: 0.0), middle)
+    assert not _early_after(trips(lambda t: -1e-4 * t), middle)
+    # A world that falls behind makes its modules late, not early.
+    assert not _early_after(trips(lambda t: 50e6 if t > middle else 0.0), middle)
+
+
+def test_noise_is_measured_under_motion_and_through_stretches_that_are_stuck() -> None:
+    t = 4e-3 * np.arange(2000)
+    signal: Array = 3.0 * np.sin(6.0 * t) + 1e-3 * np.random.default_rng(1).standard_normal(2000)
+    assert sample_noise(signal) == pytest.approx(1e-3, rel=0.1)
+    signal[600:] = np.where(np.arange(1400) < 700, signal[600], signal[600:])
+    assert sample_noise(signal) > 3e-4
+
+
+def test_runs_are_the_stretches_of_equal_values() -> None:
+    found = runs(np.array([1.0, 1.0, 2.0, 3.0, 3.0, 3.0]), 2)
+    assert [(one.start, one.end) for one in found] == [(0, 2), (3, 6)]
+    assert found[1].length == 3
