@@ -1,4 +1,4 @@
-"""What real time costs with one process per module: figures to read, no assertion on any of them.
+"""What real time costs, with one process per module and with several in each: figures, nothing is asserted.
 
 Speeds are only worth something on a machine that is otherwise idle; CPU time per tick is robust. A tick can
 be no shorter than the CPU time of all processes over the number of cores.
@@ -18,12 +18,19 @@ from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, every
 from module_agent.wire.messages import Feedback
+from sim.processes.fleet import FleetConfig, run_fleet
+from sim.processes.fleet_figures import FleetFigures
+from sim.processes.fleet_plan import plan_fleet
 from sim.processes.launcher import Child, LaunchConfig, Launcher, last_output, stop_child
 from sim.robot.robot_file import load_robot
+from tests.benchmarks.bare_barrier import measure
+from tests.benchmarks.bars import report
 
 pytestmark = pytest.mark.benchmark
 
 WINDOW_S = 20.0
+# How long a moved robot and a bare barrier are measured.
+MOVED_S, BARE_S = 15.0, 4.0
 STARTUP_S = 60.0
 _HERTZ = os.sysconf("SC_CLK_TCK")
 CORES = os.cpu_count() or 1
@@ -75,11 +82,15 @@ class Ear:
         self._transport.close()
 
 
-@pytest.fixture
-def endpoint() -> str:
+def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
 
 
 def _measure(ear: Ear, children: dict[str, list[int]], serials: tuple[str, ...]) -> None:
@@ -133,33 +144,32 @@ def test_sixteen_modules_in_real_time(tmp_path: Path, endpoint: str, processes: 
     ear.close()
 
 
-@pytest.mark.parametrize("speed", [1.0, 0.25])
-def test_sixteen_modules_in_real_time_while_they_move(tmp_path: Path, endpoint: str, speed: float) -> None:
-    """A coordinator identifies the robot meanwhile: one joint moves, 16 agents listen to it, all hold."""
-    robot = load_robot("snake16")
-    config = LaunchConfig(
-        "snake16",
-        robot.name,
-        robot.serials,
-        tmp_path,
-        speed=speed,
-        endpoint=endpoint,
-        network="none",
-        coordinator_options=("--no-advise",),
+@pytest.mark.parametrize(("modules", "processes", "bar"), [(16, 16, 1.0), (32, 4, 1.5), (64, 8, 0.8)])
+def test_robots_moved_by_a_coordinator_beside_a_bare_barrier(
+    tmp_path: Path, modules: int, processes: int, bar: float
+) -> None:
+    """All joints are held at 1 kHz and move in turn; asked for twice what the bar is, so that it can miss it.
+
+    The bare barrier runs before and after, so that both see the same machine.
+    """
+    bares = [measure(tmp_path, processes, modules, BARE_S, free_endpoint())]
+    plan = plan_fleet(1, modules, (free_endpoint(),), processes)
+    figures = run_fleet(FleetConfig(plan, tmp_path, MOVED_S, 2.0 * bar, moves=True), lambda text: None)
+    bares.append(measure(tmp_path, processes, modules, BARE_S, free_endpoint()))
+    bare_us = min(bare.us_per_module_tick for bare in bares)
+    what = f"{modules} modules in {processes} processes, moved by a coordinator"
+    broke = "; ".join(figures.broke) or "nothing"
+    report(f"{what}: times real time", figures.real_time, at_least=bar, anchor=f"broke first: {broke}")
+    served_us = _served_us(figures)
+    anchor = f"{served_us:.1f} us of world and agents over {bare_us:.1f} us"
+    report(
+        f"{what}: CPU a module-tick over a bare barrier's", served_us / bare_us, at_most=1.5, anchor=anchor
     )
-    print(f"\nsnake16, 16 agent processes, {speed:g} x real time asked for, a coordinator runs its motions")
-    with Launcher(config, lambda text: None) as launcher:
-        world = launcher.start_world()
-        agents = launcher.start_agents()
-        coordinator = launcher.start_coordinator(quiet=True)
-        ear = Ear(robot.name, ZenohConfig(mode="client", connect=(endpoint,), connect_timeout_s=STARTUP_S))
-        ear.wait_for(robot.serials, world)
-        # The first motions come after discovery, the check of the link and a rest.
-        time.sleep(10.0 / speed)
-        children = {"world": [world.process.pid], "agent": [a.process.pid for a in agents]}
-        children |= {"coordinator": [coordinator.process.pid], "listener": [os.getpid()]}
-        if coordinator.process.poll() is None:
-            _measure(ear, children, robot.serials)
-        else:
-            print(f"  too fast for this machine: {last_output(coordinator)}")
-        ear.close()
+    report(f"{what}: CPU a module-tick, coordinator and router too", figures.us_per_module_tick, "us")
+    report(f"{what}: motions done", figures.motions, anchor=f"{figures.motions_failed} not")
+
+
+def _served_us(figures: FleetFigures) -> float:
+    """Return the processor time of world and agents for each module and tick [us]."""
+    percent = sum(figures.kinds[kind].cpu_percent for kind in ("world", "agent"))
+    return 1e4 * percent / (1e3 * figures.real_time * figures.modules)

@@ -7,7 +7,6 @@
 import asyncio
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -27,6 +26,7 @@ from module_agent.wire.feedback_rows import ROW, unpack
 from module_agent.wire.messages import Feedback
 from module_agent.wire.row_log import RowLog
 from tests.benchmarks.bars import least_cpu_of, report
+from tests.benchmarks.test_real_time import free_endpoint
 from tests.benchmarks.wire_publisher import BARE, BATCH, ROBOT, Sent, resident_kb
 
 pytestmark = pytest.mark.benchmark
@@ -55,12 +55,6 @@ class Round(NamedTuple):
     @property
     def lost(self) -> int:
         return sum(one.rows for one in self.sent) * (MODULES // PROCESSES) - self.heard.rows
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Publishers:
