@@ -14,6 +14,7 @@ from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing,
 from module_agent.firmware.quiet_ticks import NOT_QUIET, ROW_DUE, QuietTicks
 from module_agent.hardware.hardware import Modules, ModuleSample, Readings
 from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.errors import RobotError
 from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
@@ -100,7 +101,7 @@ class HostedModule:
 
     def step(self, sample: ModuleSample) -> Command:
         """Begin a tick on what was collected before the sample was taken; return the module's command."""
-        self.now_ns = sample.sensors.t_ns
+        self.now_ns = max(0, sample.sensors.t_ns)
         if not self._arrived:
             return self.firmware.step(sample, ())
         incoming: list[Incoming] = []
@@ -266,11 +267,11 @@ class AgentHost:
         if self._from_others.waiting:
             # Their times are those of the last tick until the modules are run.
             for place, module in enumerate(self.modules, self._place):
-                module.now_ns = quiet.before_ns[place]
+                module.now_ns = max(0, quiet.before_ns[place])
             self._read_others()
         for index, module in enumerate(self.modules):
             place = self._place + index
-            module.now_ns = quiet.now_ns[place]
+            module.now_ns = max(0, quiet.now_ns[place])
             if results[place] == NOT_QUIET:
                 quiet.load(place)
                 command = module.step(self._loops.take(index, readings[place]))
@@ -313,9 +314,11 @@ class AgentHost:
         for event in self._from_others.drain(limit=512):
             try:
                 self._on_event(event, clocks)
-            except WireError as error:
+            except RobotError as error:
+                # Whatever a message leads to ends with that message.
+                reason = error.reason if isinstance(error, WireError) else Refusal.MALFORMED
                 for module in self.modules:
-                    module.firmware.admission.count(error.reason)
+                    module.firmware.admission.count(reason)
 
     def _on_event(self, event: Event, clocks: dict[str, int]) -> None:
         if isinstance(event, Reply):

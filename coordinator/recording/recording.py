@@ -33,6 +33,10 @@ Kind = Exchange | Literal["journal"]
 JOURNAL_TOPIC = "journal"
 # Requests that wait for an answer; an answer comes within seconds, if it comes.
 MAX_OPEN_REQUESTS = 4096
+# Of one module in one session, and of modules: what is beyond is made up, and is not to fill the memory.
+MAX_BOOTS, MAX_MODULES = 32, 1024
+# Of one joint by one module: motions that it was estimated from.
+MAX_ESTIMATES = 256
 
 
 class Entry(NamedTuple):
@@ -153,9 +157,22 @@ class Recording:
         """Return the record of one boot of a module, new if it was not known."""
         record = self.past.get((serial, boot))
         if record is None:
+            self._make_room(serial)
             # A late message of an earlier boot does not make that boot the latest again.
             record = self.past[serial, boot] = self.modules[serial] = ModuleRecord(serial, boot)
         return record
+
+    def _make_room(self, serial: str) -> None:
+        """Forget the boot of a module with the fewest rows where there are too many.
+
+        Raises:
+            WireError: LIMIT, there are too many modules.
+        """
+        if serial not in self.modules and len(self.modules) >= MAX_MODULES:
+            raise WireError(Refusal.LIMIT, f"{serial} is one module more than {MAX_MODULES}")
+        boots = [record for (each, _), record in self.past.items() if each == serial]
+        if len(boots) >= MAX_BOOTS:
+            del self.past[serial, min(boots, key=lambda record: record.rows.count).boot]
 
     def add(self, entry: Entry) -> Message | JournalEvent:
         """Add one entry; return its message.
@@ -273,8 +290,13 @@ class Recording:
                 module.info = message
                 module.newest_ns = max(module.newest_ns, message.t_ns)
             case Estimate():
+                known = message.joint in self.modules or message.joint == message.serial
+                if not known and len(self.estimates) >= MAX_MODULES:
+                    raise WireError(Refusal.LIMIT, f"no module {message.joint} was heard of")
                 estimates = self.estimates.setdefault((message.joint, message.serial), {})
                 estimates[message.motion_ids] = message
+                if len(estimates) > MAX_ESTIMATES:
+                    del estimates[next(iter(estimates))]
             case Information():
                 module.information.setdefault(message.digest, {})[message.offset] = message
 

@@ -147,9 +147,10 @@ class Firmware:
         self._sample = sample
         self._limited |= sample.limits
         sensors = sample.sensors
-        now_ns, before_ns = sensors.t_ns, self._now_ns
+        # No message can carry a time before the clock's zero: until then the module is in fault, at 0.
+        now_ns, before_ns = max(sensors.t_ns, 0), self._now_ns
         self._now_ns = now_ns
-        if now_ns <= before_ns:
+        if now_ns <= before_ns and before_ns > 0:
             self._begin_time_anew(before_ns)
         if self.state in COMMANDED and now_ns - self._fresh_ns > self.config.lifetime_ns:
             self._expire()
@@ -160,9 +161,9 @@ class Firmware:
         if sensors.winding_temperature_c >= self.config.safety.winding_c and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", f"winding at {sensors.winding_temperature_c:.0f} C")
-        if sample.fault and self.state != "fault":
+        if (fault := _fault(sample)) and self.state != "fault":
             self._finish_motion("fault")
-            self._enter("fault", sample.fault)
+            self._enter("fault", fault)
         if sample.m_stop:
             self._obey_m_stop()
         return self._commands[self.state]()
@@ -387,8 +388,8 @@ class Firmware:
         cool_c = self.config.safety.winding_c - WINDING_REARM_K
         if self.state == "fault" and winding_c > cool_c:
             raise WireError(Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {cool_c:.0f} C")
-        if self._sample.fault:
-            raise WireError(Refusal.NOT_ARMED, self._sample.fault)
+        if fault := _fault(self._sample):
+            raise WireError(Refusal.NOT_ARMED, fault)
         self._check_m_stop()
         if self.state == "stopped" and request.echo_ns <= self._stopped_ns:
             raise WireError(Refusal.STALE, "sent before the stop: its sender cannot have known of it")
@@ -501,6 +502,12 @@ class Firmware:
             gains=self._gains,
             t_ns=self._now_ns,
         )
+
+
+def _fault(sample: ModuleSample) -> str:
+    """Return what the module reports to be wrong with it, or what is wrong with its clock."""
+    t_ns = sample.sensors.t_ns
+    return sample.fault or (f"the module's clock reads {t_ns} ns, before its zero" if t_ns < 0 else "")
 
 
 def acknowledgement(

@@ -10,11 +10,14 @@ from typing import NamedTuple
 
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import EXPLORATION_KINDS, Feedback, MotionRecord, Status
+from module_agent.wire.refusal import Refusal, WireError
 from module_agent.wire.row_log import RowLog
 
 ANSWER_TIMEOUT_NS = 400_000_000
 GIVE_UP_NS = 5_000_000_000
 ROWS_PER_QUESTION = 256
+# Modules, and boots of them, whose announcements are remembered; more than any robot has.
+MAX_MODULES, MAX_BOOTS = 256, 1024
 
 
 class Listen(NamedTuple):
@@ -103,11 +106,21 @@ class MotionListener:
         if newest is not None and (self._boot[status.serial] != status.boot or status.seq <= newest):
             return True
         self._boot[status.serial] = status.boot
+        # The latest last, so that what is forgotten was not heard of for the longest time.
+        self._newest.pop((status.serial, status.boot), None)
         self._newest[status.serial, status.boot] = status.seq
+        if len(self._newest) > MAX_BOOTS:
+            del self._newest[next(iter(self._newest))]
         return False
 
     def on_status(self, status: Status, now_ns: int, own_ns: Mapping[str, int]) -> None:
-        """Take notice of a status; `now_ns` is any one steady clock of this process."""
+        """Take notice of a status; `now_ns` is any one steady clock of this process.
+
+        Raises:
+            WireError: LIMIT, it is of one module too many.
+        """
+        if status.serial not in self._boot and len(self._boot) >= MAX_MODULES:
+            raise WireError(Refusal.LIMIT, f"{status.serial} is one module more than {MAX_MODULES}")
         if self._is_outdated(status):
             return
         self.has_work = True

@@ -14,6 +14,7 @@ from module_agent.wire.messages import (
     Message,
     Name,
     Part,
+    Serial,
     Vector3,
     out_of_range,
 )
@@ -35,7 +36,7 @@ Instant = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)]
 class RowRange(Part):
     """Feedback rows `first_row` up to and without `end_row` of one boot of a module, at least one."""
 
-    serial: Name
+    serial: Serial
     boot: Annotated[int, Field(ge=0, lt=2**64)]
     first_row: Counter
     end_row: Counter
@@ -72,7 +73,7 @@ class CollectRequest(Message):
 class ChainPart(Part):
     """A `model.chain.Chain` of n modules; `geometry` is one block of little-endian doubles, (n, 22)."""
 
-    serials: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MAX_MODULES)]
+    serials: Annotated[tuple[Serial, ...], Field(min_length=1, max_length=MAX_MODULES)]
     parent: tuple[Annotated[int, Field(ge=-1, lt=MAX_MODULES)], ...]
     reversed: tuple[bool, ...]
     geometry: Annotated[bytes, Field(max_length=MAX_MODULES * GEOMETRY_BYTES)]

@@ -16,6 +16,8 @@ Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 Counter = Annotated[int, Field(ge=0, lt=2**63)]
 MAX_NAME = 64
 Name = Annotated[str, Field(max_length=MAX_NAME)]
+# One that stands for a module in a key: with any other no module could be asked.
+Serial = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,63}$")]
 Text = Annotated[str, Field(max_length=512)]
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -364,7 +366,7 @@ class EstimateRequest(Message):
     """Ask for this module's estimate from the latest motion of `joint`."""
 
     sender: Name
-    joint: Name
+    joint: Serial
 
 
 class HistoryRequest(Message):

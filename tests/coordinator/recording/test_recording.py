@@ -8,7 +8,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from coordinator.recording.journal import JournalEvent
-from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording, RoundTrip
+from coordinator.recording.recording import (
+    JOURNAL_TOPIC,
+    MAX_BOOTS,
+    MAX_MODULES,
+    Entry,
+    Recording,
+    RoundTrip,
+)
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, Rest, Status, Stop
@@ -237,3 +244,26 @@ def test_a_status_is_decoded_as_it_was_sent(recording: Recording, wire: SimpleNa
     assert isinstance(decoded, Status)
     assert decoded == sent
     assert recording.modules["A"].status == sent
+
+
+def test_boots_that_were_made_up_are_forgotten_before_those_with_rows(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
+    for first in range(0, 100, 5):
+        recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=first)))
+    for boot in range(1000, 3000):
+        recording.add(wire.publication(Leaf.STATUS, wire.status(boot=boot)))
+    assert len(recording.past) == MAX_BOOTS
+    assert recording.past["A", 7].rows.count == 100
+
+
+def test_modules_that_were_made_up_do_not_fill_the_memory(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
+    for number in range(MAX_MODULES + 100):
+        recording.accept(wire.publication(Leaf.STATUS, wire.status(f"M{number}")))
+    assert len(recording.modules) == MAX_MODULES
+    assert recording.refused == {"limit": 100}
+    # The modules that were there before go on being recorded.
+    assert recording.accept(wire.publication(Leaf.STATUS, wire.status("M5", t_ns=9))) is not None
+    assert recording.modules["M5"].newest_ns == 9

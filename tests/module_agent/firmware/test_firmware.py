@@ -736,3 +736,24 @@ def test_a_motion_that_others_estimate_from_is_announced_to_them_until_five_seco
     # How a joint goes from one motion to the next is of no interest to the others.
     moved(2, GoTo(target_rad=0.3, max_speed_rad_s=1.0), 500)
     assert announced() == []
+
+
+def test_a_clock_before_its_zero_is_a_fault_that_is_named_and_not_the_end() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.now = -5_000 * MS
+    for _ in range(10):
+        bench.tick()
+        assert bench.pwm == 0.0
+    status = bench.status()
+    assert (status.state, status.t_ns) == ("fault", 0)
+    assert "before its zero" in status.note
+    assert refused(bench.acquire(echo_ns=0), Refusal.NOT_ARMED)
+    assert bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=9, sender="me")).accepted
+    # When zero has passed it is a module like any other.
+    bench.now = 100 * MS
+    bench.ticks(20)
+    assert bench.acquire().accepted
+    published = len(bench.published)
+    bench.ticks(100)
+    assert len(bench.published) > published

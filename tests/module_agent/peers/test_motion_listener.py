@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from module_agent.peers.motion_listener import (
     ANSWER_TIMEOUT_NS,
     GIVE_UP_NS,
+    MAX_BOOTS,
+    MAX_MODULES,
     ROWS_PER_QUESTION,
     Action,
     AskHistory,
@@ -18,6 +20,7 @@ from module_agent.peers.motion_listener import (
 )
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.messages import ConstantMotion, Feedback, GoTo, MotionRecord, Pattern, Status
+from module_agent.wire.refusal import WireError
 
 MS = 1_000_000
 BATCH = 5
@@ -315,3 +318,18 @@ def test_over_any_network_a_motion_is_handed_over_complete_and_once_or_not_at_al
     assert not listening
     if loss == 0.0 and not silent and not lost_rows:
         assert numbers == [11, 12]
+
+
+def test_modules_and_boots_that_were_made_up_are_remembered_up_to_a_bound() -> None:
+    listener, refused = MotionListener(), 0
+    for number in range(5000):
+        listener.on_status(_status(None, boot=number), 0, OWN)
+        try:
+            listener.on_status(_status(_record(end=None), serial=f"M{number}"), 0, OWN)
+        except WireError:
+            refused += 1
+    assert len(listener._newest) == MAX_BOOTS
+    assert refused == 5000 - (MAX_MODULES - 1)
+    # A module that was heard of before is heard on.
+    listener.on_status(_status(_record(2), seq=9, boot=5001), 0, OWN)
+    assert listener._tracks["J"].record.motion_id == 2
