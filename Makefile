@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo kinematics dynamics thesis test coverage check bench clean
+.PHONY: help demo kinematics dynamics thesis test coverage safety mutants check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh in processes of its own, and is scored"
@@ -18,6 +18,8 @@ help:
 	@echo "make thesis  the thesis' experiments side by side with what was printed, few trials, under three minutes"
 	@echo "make test    all tests"
 	@echo "make coverage  branch coverage of what runs in one process"
+	@echo "make safety  branch coverage of the safety core, which must be whole"
+	@echo "make mutants every change of the safety core that its tests do not notice; half an hour, goes on where it stopped"
 	@echo "make check   format, lint, types, floors and doors"
 	@echo "make bench   benchmarks"
 	@echo "make clean   remove .venv and caches; runs/ stays"
@@ -63,6 +65,12 @@ test: $(DEV)
 coverage: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup --ignore tests/integration --ignore tests/simulation \
 		--cov module_agent --cov coordinator --cov sim --cov-branch --cov-report term:skip-covered
+
+safety: $(DEV)
+	$(BIN)/python -m tests.safety_core coverage
+
+mutants: $(DEV)
+	$(BIN)/python -m tests.safety_core mutants
 
 check: $(DEV)
 	$(BIN)/ruff format --check .

@@ -1,0 +1,93 @@
+"""A sensor that reads what no working module can is held over, then named; a good one is left as it is."""
+
+import math
+
+import pytest
+
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.sample_check import MAX_HELD, SampleCheck
+from module_agent.model.catalogue import AMBIENT_C, CATALOGUE
+
+KIND = CATALOGUE["X5-9"]
+GOOD = SensorSample(5, 4, *(0.1 * k for k in range(1, 16)))  # type: ignore[call-arg]
+FIELDS = SensorSample._fields[2:]
+# The largest believable readings, by what limits each.
+MOST = dict(
+    zip(
+        FIELDS,
+        (
+            *(1e4, 50.0 * 1.466, 50.0 * 13.0, 10.0, 50.0 * 1.466 * 1742.22, 200.0, 400.0, 100.0),
+            *(500.0, 500.0, 500.0, 5e4, 5e4, 5e4, 50.0 * 1.466),
+        ),
+        strict=True,
+    )
+)
+
+
+def test_a_good_sample_is_itself() -> None:
+    check = SampleCheck(KIND)
+    assert not check.is_clean
+    assert check.checked(GOOD) is GOOD
+    assert (check.is_clean, check.fault) == (True, "")
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_the_largest_reading_is_good_and_the_next_one_is_not(name: str) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    for sign in (1.0, -1.0):
+        most = sign * MOST[name]
+        at_limit = GOOD._replace(**{name: most})
+        assert check.checked(at_limit) is at_limit
+        beyond = GOOD._replace(**{name: math.nextafter(most, sign * math.inf)})
+        assert check.checked(beyond) == at_limit
+        assert not check.is_clean
+        check.checked(GOOD)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_one_bad_value_is_replaced_and_all_others_are_new(name: str) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    new = SensorSample(9, 8, *(0.2 * k for k in range(1, 16)))  # type: ignore[call-arg]
+    checked = check.checked(new._replace(**{name: math.nan}))
+    assert checked == new._replace(**{name: getattr(GOOD, name)})
+    # What was held over goes on being so.
+    assert check.checked(new._replace(**{name: math.inf})) == checked
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_next_to_a_bad_value_the_largest_good_one_is_kept(name: str) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    other = FIELDS[FIELDS.index(name) - 1]
+    assert getattr(check.checked(GOOD._replace(**{name: MOST[name], other: math.nan})), name) == MOST[name]
+
+
+def test_the_sixth_bad_sample_in_a_row_is_a_fault_and_a_good_one_ends_it() -> None:
+    check = SampleCheck(KIND)
+    bad = GOOD._replace(effort_nm=math.nan, voltage_v=-101.0)
+    for _ in range(2):
+        check.checked(GOOD)
+        for _ in range(MAX_HELD):
+            check.checked(bad)
+            assert check.fault == ""
+        check.checked(bad)
+        assert check.fault == "voltage_v reads -101, possible are -100 .. 100"
+        check.checked(GOOD)
+        assert check.fault == ""
+    assert MAX_HELD == 5
+
+
+def test_before_a_good_sample_a_bad_one_is_a_fault_at_once_and_reads_as_at_rest() -> None:
+    check = SampleCheck(KIND)
+    first = check.checked(SensorSample(3, 2, *(math.nan,) * 15))  # type: ignore[call-arg]
+    assert first == SensorSample(3, 2, *(0.0,) * 6, AMBIENT_C, *(0.0,) * 8)  # type: ignore[call-arg]
+    assert "deflection_velocity_rad_s reads nan" in check.fault
+
+
+def test_a_quiet_tick_gives_the_values_that_are_held_over_next() -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    check.go_on(GOOD._replace(position_rad=7.0))
+    assert check.checked(GOOD._replace(position_rad=math.nan)).position_rad == 7.0

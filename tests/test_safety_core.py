@@ -1,0 +1,42 @@
+"""The list of explained survivors is one of changes to the safety core, and words alone need no entry."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.safety_core import Mutant, changes_words_only, core, explained
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_core_and_tests_are_files_of_the_project() -> None:
+    for path in (*core().files, *core().tests):
+        assert (ROOT / path).is_file(), path
+
+
+def test_every_explained_survivor_changes_a_line_that_is_there() -> None:
+    """An entry for code that is gone would hide nothing, and mislead."""
+    modules = {path.removesuffix(".py").replace("/", "."): (ROOT / path).read_text() for path in core().files}
+    for one, why in explained().items():
+        (module,) = [name for name in modules if one.where.startswith(f"{name}.")]
+        lines = [line.strip() for line in modules[module].splitlines()]
+        assert all(line in lines for line in one.was.splitlines()), one
+        assert one.was != one.becomes
+        assert len(why.split()) > 5, one
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "words"),
+    [
+        ('raise A(f"at {x} rad")', 'raise A(f"XXat {x} radXX")', True),
+        ('raise A(B.C, "no lease")', 'raise A(B.C, "NO LEASE")', True),
+        ('raise A(B.C, "no lease")', "raise A(B.C, None)", False),
+        ('state = "armed"', 'state = "XXarmedXX"', False),
+        ('if x < 1: say("too low")', 'if x < 2: say("too low")', False),
+        ('f"at {x} "', 'f"XXat {x} XX"', True),
+    ],
+)
+def test_a_change_of_words_is_one_of_a_sentence_and_of_nothing_else(
+    was: str, becomes: str, words: bool
+) -> None:
+    assert changes_words_only(Mutant("a.b", was, becomes)) is words
