@@ -130,7 +130,7 @@ def mutants(run: bool) -> int:
         subprocess.call(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
     os.chdir(ROOT)
     decided = results()
-    alive = {name: mutant(name) for name, status in decided.items() if status != KILLED}
+    alive = {name: mutant(name) for name, status in decided.items() if status not in (KILLED, NOT_CHECKED)}
     survivors = {name: one for name, one in alive.items() if decided[name] == SURVIVED}
     words = {name for name, one in survivors.items() if changes_words_only(one)}
     reasons = explained()
@@ -143,19 +143,14 @@ def mutants(run: bool) -> int:
         + f"; of the survivors {len(words)} change words of a message, {known} are explained in "
         f"{SURVIVORS.relative_to(ROOT)}"
     )
-    _print_open(open_ones, decided)
-    for one in reasons.keys() - set(survivors.values()):
-        print(f"explained, and no survivor any more: {one.where}: {one.was!r} -> {one.becomes!r}")
-    return 1 if open_ones or not decided else 0
-
-
-def _print_open(open_ones: dict[str, Mutant], decided: dict[str, str]) -> None:
-    waiting = sum(decided[name] == NOT_CHECKED for name in open_ones)
+    waiting = counts[NOT_CHECKED]
     if waiting:
         print(f"{waiting} are not checked: run it again, it goes on where it has stopped")
     for name, one in open_ones.items():
-        if decided[name] != NOT_CHECKED:
-            print(f"\n{decided[name]}, not explained: {name}\n  {one.where}\n- {one.was}\n+ {one.becomes}")
+        print(f"\n{decided[name]}, not explained: {name}\n  {one.where}\n- {one.was}\n+ {one.becomes}")
+    for one in reasons.keys() - set(survivors.values()):
+        print(f"explained, and no survivor any more: {one.where}: {one.was!r} -> {one.becomes!r}")
+    return 1 if open_ones or waiting or not decided else 0
 
 
 def main(arguments: list[str]) -> int:

@@ -125,6 +125,28 @@ def test_hold_carries_the_load_at_the_limit_and_a_spring_gives_way(sign: float) 
     )
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_exactly_at_its_limit_a_spring_still_carries_the_load(sign: float) -> None:
+    sample = reading(q=sign * 0.5, effort_nm=-sign * 4.0)
+    hold = driven(guard(position_rad=RANGE), sign, sample)
+    assert driven(guard(position_rad=RANGE, at_limit="spring"), sign, sample) == hold
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("limits", [{"position_rad": RANGE}, {"velocity_rad_s": 0.1}, {"effort_nm": 1.0}])
+def test_what_is_exactly_at_a_bound_is_not_limited(limits: dict[str, Any], sign: float) -> None:
+    sample = reading(q=sign * 0.45)
+    bound, state = driven(guard(**limits), sign, sample)
+    assert state is not LimitState.NONE
+    assert driven(guard(**limits), bound, sample) == (bound, LimitState.NONE)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_torque_exactly_at_its_limit_is_not_too_much(sign: float) -> None:
+    pwm, _ = driven(guard(effort_nm=3.0), sign, reading(speed=sign, effort_nm=sign * 3.0))
+    assert pwm == pytest.approx(sign * (LOAD * 3.0 + EMF))
+
+
 def test_a_disabled_side_bounds_nothing() -> None:
     limiter = guard(position_rad=RANGE, at_limit=("hold", "disabled"))
     assert driven(limiter, 0.4, reading(q=7.0)) == (0.4, LimitState.NONE)
