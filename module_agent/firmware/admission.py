@@ -96,7 +96,6 @@ class Lease:
     def release(self) -> None:
         """End the lease; the token stays, so that old commands stay refused."""
         self.holder, self._secret = None, b""
-        self._until_ns = 0
 
     def check(self, sender: str, token: int, payload: bytes) -> None:
         """Check that a command, `payload` on the wire, comes from the present holder under the present token.
