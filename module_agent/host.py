@@ -278,7 +278,7 @@ class AgentHost:
                 out = module.publish(self._loops.run(index, command))
                 quiet.store(place)
             elif results[place] == ROW_DUE:
-                out = module.firmware.keep_row(quiet.row(place))
+                out = quiet.keep_rows(place)
             else:
                 continue
             for outgoing in out:

@@ -28,11 +28,13 @@ class History:
         """The number of the oldest row in the ring."""
         return max(0, self.next_row - self.capacity)
 
-    def keep(self, row: memoryview) -> None:
-        """Add one row by its bytes."""
-        start = self.next_row % self.capacity * ROW.itemsize
-        self._bytes[start : start + ROW.itemsize] = row
-        self.next_row += 1
+    def keep(self, rows: memoryview) -> None:
+        """Add rows, no more than there is room for in the ring, by their bytes."""
+        start, room = self.next_row % self.capacity * ROW.itemsize, len(self._bytes)
+        fitting = min(len(rows), room - start)
+        self._bytes[start : start + fitting] = rows[:fitting]
+        self._bytes[: len(rows) - fitting] = rows[fitting:]
+        self.next_row += len(rows) // ROW.itemsize
 
     def append(self, values: tuple[float, ...]) -> None:
         """Add one row: its values in the order of `feedback_rows.ROW`, vectors element by element."""
@@ -145,9 +147,14 @@ class FeedbackStream:
         )
         return self._batch()
 
-    def keep(self, row: memoryview) -> tuple[int, int] | None:
-        """Add the row of a tick by its bytes; return the batch complete with it, as `append` does."""
-        self.history.keep(row)
+    @property
+    def rows_to_batch(self) -> int:
+        """How many rows complete the batch that is to be published next."""
+        return self._sent_row + self._batch_rows - self.history.next_row
+
+    def keep(self, rows: memoryview) -> tuple[int, int] | None:
+        """Add at most `rows_to_batch` rows by their bytes; return the batch that they complete, if any."""
+        self.history.keep(rows)
         return self._batch()
 
     def _batch(self) -> tuple[int, int] | None:

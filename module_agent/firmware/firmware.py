@@ -222,9 +222,14 @@ class Firmware:
         self._command = Command(position_rad, velocity_rad_s, effort_nm)
         self._rows.go_on(due_ns, imu_ns)
 
-    def keep_row(self, row: memoryview) -> list[Outgoing]:
-        """Keep the feedback row of a quiet tick; return what to send."""
-        batch = self._rows.keep(row)
+    @property
+    def rows_to_batch(self) -> int:
+        """How many feedback rows of quiet ticks complete the next batch to be sent."""
+        return self._rows.rows_to_batch
+
+    def keep_rows(self, rows: memoryview) -> list[Outgoing]:
+        """Keep feedback rows of quiet ticks, at most `rows_to_batch`; return what to send."""
+        batch = self._rows.keep(rows)
         return [] if batch is None else [Publication(Leaf.FEEDBACK, encode(self._feedback(*batch)))]
 
     def _command_of_state(self) -> dict[State, Callable[[], Command]]:

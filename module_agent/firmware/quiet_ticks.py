@@ -6,12 +6,12 @@ them what quiet ticks have changed, `store` takes what the kernel needs. What on
 state, motion, gains) is in the objects alone.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from module_agent.firmware import tick_kernel as kernel
-from module_agent.firmware.firmware import Firmware
+from module_agent.firmware.firmware import Firmware, Outgoing
 from module_agent.firmware.tick_kernel import NOT_QUIET, QUIET, ROW_DUE, Floats
 from module_agent.hardware.hardware import Readings
 from module_agent.hardware.loop_inside import LoopInside
@@ -21,6 +21,8 @@ __all__ = ["NOT_QUIET", "QUIET", "ROW_DUE", "QuietTicks"]
 
 # Milliseconds of motion; a longer one makes more room.
 _SAMPLES = 8192
+# Feedback rows that can wait for Python.
+_HELD_ROWS = 16
 
 
 class _Module(NamedTuple):
@@ -50,7 +52,11 @@ class QuietTicks:
         self._integers = np.zeros((modules, 6), np.int64)
         self._last = Readings(modules)
         self._rows = np.zeros(modules, kernel.FLAT_ROW)
-        self._row_bytes = self._rows.view(np.uint8).data
+        # The rows of several ticks, of each module as many as `_held` says, and as `_room` says at most.
+        self._held_rows = np.zeros((modules, _HELD_ROWS, ROW.itemsize), np.uint8)
+        self._held = np.zeros(modules, np.int64)
+        self._room = np.ones(modules, np.int64)
+        self._times = np.zeros((2, modules), np.int64)
         self._results = np.zeros(modules, np.uint8)
         self.pwm = self._floats[:, kernel.PWM]
         # The time of the last tick that a module's objects have run.
@@ -66,7 +72,7 @@ class QuietTicks:
         self._objects[place] = _Module(firmware, loops, index)
         self._stored[place] = (None, None)
         self._modules[place]["ready"] = 0
-        self._integers[place] = self._run_ns[place] = 0
+        self._integers[place] = self._run_ns[place] = self._held[place] = 0
         self._most[place] = loops.most(index)
 
     def detach(self, place: int) -> None:
@@ -76,12 +82,18 @@ class QuietTicks:
 
     def run(self, readings: Readings, busy: list[int]) -> list[int]:
         """Run a tick of all places but the `busy` ones; return the result of each, see `tick_kernel`."""
-        for place in busy:
-            self._modules[place]["ready"] = 0
-        self.before_ns, self.now_ns = self.now_ns, readings.integers[:, 0].tolist()
-        kernel.tick(
-            readings.integers,
-            readings.floats,
+        self.begin_run(busy)
+        self._times[0], self._times[1] = self._times[1], readings.integers[:, 0]
+        kernel.tick(readings.integers, readings.floats, *self.arrays)
+        for place in np.flatnonzero(self._results == ROW_DUE).tolist():
+            self._held_rows[place, 0] = self._rows[place : place + 1].view(np.uint8)
+            self._held[place] = 1
+        return self.end_run()
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The arguments of `tick_kernel.tick` after the readings."""
+        return (
             self._last.floats,
             self._modules,
             self._most,
@@ -93,12 +105,35 @@ class QuietTicks:
             self._rows,
             self._results,
         )
+
+    def begin_run(self, busy: list[int]) -> tuple[Any, ...]:
+        """Begin one or more ticks of all places but the `busy` ones; return what a kernel keeps of them.
+
+        That is: the next PWM (n,); how many rows a module may hold (n,), and holds (n,), and those as bytes
+        (n, rows, bytes); the rows of a tick as bytes (n, bytes); the modules' times in the tick before the
+        last and in the last one (2, n); the results of the last (n,).
+        """
+        for place in busy:
+            self._modules[place]["ready"] = 0
+        rows = self._rows.view(np.uint8).reshape(len(self._rows), -1)
+        return self.pwm, self._room, self._held, self._held_rows, rows, self._times, self._results
+
+    def end_run(self) -> list[int]:
+        """End the ticks of a run; return the result of the last for each place, see `tick_kernel`.
+
+        `ROW_DUE` says that a place holds rows, of earlier ticks too.
+        """
+        self.before_ns, self.now_ns = self._times.tolist()
         results: list[int] = self._results.tolist()
         return results
 
-    def row(self, place: int) -> memoryview:
-        """Return the bytes of the feedback row that a place's last tick has made."""
-        return self._row_bytes[place * ROW.itemsize : (place + 1) * ROW.itemsize]
+    def keep_rows(self, place: int) -> list[Outgoing]:
+        """Give a module the feedback rows that it holds; return what it sends."""
+        module, count = self._objects[place], self._held[place]
+        assert module is not None
+        out = module.firmware.keep_rows(self._held_rows[place, :count].reshape(-1).data)
+        self._held[place], self._room[place] = 0, min(module.firmware.rows_to_batch, _HELD_ROWS)
+        return out
 
     def load(self, place: int) -> None:
         """Let the objects of a module go on from where its quiet ticks ended."""
@@ -108,6 +143,8 @@ class QuietTicks:
         if now_ns == self._run_ns[place]:
             # The objects have run the last tick.
             return
+        if self._held[place]:
+            self.keep_rows(place)
         floats = self._floats[place].tolist()
         module.firmware.go_on(now_ns, floats[:3], due_ns, imu_ns, limited)
         pwm, memory = floats[kernel.PWM], self._memory[place].tolist()
@@ -149,6 +186,7 @@ class QuietTicks:
         self._integers[place] = (*firmware.row_times, *own)
         self._memory[place] = [loop.memory for loop in controller.loops]
         self._run_ns[place] = firmware.now_ns
+        self._room[place] = min(module.firmware.rows_to_batch, _HELD_ROWS)
 
     def _store_motion(self, place: int, targets: Floats) -> None:
         samples = targets.shape[1]

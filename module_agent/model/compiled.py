@@ -1,10 +1,12 @@
 """Kernels: functions on plain arrays, compiled to machine code.
 
-The code is kept on disk and reused until the kernel's own file changes. That check does not cover other
-files, so kernels call each other within one file only. `x5-sim compile` compiles all of them in advance.
+The code is kept on disk and reused until the kernel's own file changes, or one of the files whose kernels it
+calls and which it names, see `compiled_with`. `x5-sim compile` compiles all of them in advance.
 """
 
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -18,6 +20,31 @@ def compiled(function: Function) -> Function:
     Other threads go on while it runs.
     """
     return _kernel(function)
+
+
+def compiled_with(*modules: ModuleType, inline: bool = False) -> Callable[[Function], Function]:
+    """Return `compiled` for a function that calls kernels of other modules: their code becomes part of it.
+
+    All of them must be named, those that they call in turn too: else code that is kept outlives a change.
+    With `inline` it becomes a part of the kernels that call it, as with `inlined`.
+    """
+
+    def decorate(function: Function) -> Function:
+        kernel: Any = _kernel(function, inline)
+        # Numba compares the stamp of what it has kept with this one; without a cache there is none.
+        index = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+        if index is not None:
+            index._source_stamp = (index._source_stamp, *map(_stamp, modules))
+        return cast(Function, kernel)
+
+    return decorate
+
+
+def _stamp(module: ModuleType) -> tuple[float, int]:
+    """Return what changes with a module's file."""
+    assert module.__file__ is not None
+    stat = Path(module.__file__).stat()
+    return stat.st_mtime, stat.st_size
 
 
 def inlined(function: Function) -> Function:

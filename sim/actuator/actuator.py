@@ -29,8 +29,6 @@ from sim.imperfections.noise_profile import NoiseProfile
 from sim.physics.skeleton import Skeleton
 
 BUS_VOLTAGE_V = 24.0
-# Gains are normalised to 48 V: the duty applied is the firmware's PWM times 48 V / bus voltage.
-GAIN_VOLTAGE_V = 48.0
 # The spring's loss: damping over stiffness. Springs of this kind are rubber bonded between plates (Rollinson
 # et al. 2013). Their loss factor is assumed to be 0.1 at 5 Hz, where an arm of half a metre rings on its
 # spring. With a third of it light arms ring after every reversal of the gear's friction, and the lengths by
@@ -46,6 +44,8 @@ _MIN_EFFICIENCY = 0.05
 
 class Actuators:
     """The motors and springs of n modules on m joints, without a skeleton the modules' own; see `state`.
+
+    `rows` is the state as one array.
 
     `profile` says which effects act, `variation` how the modules differ from their types.
     """
@@ -69,18 +69,32 @@ class Actuators:
             self._passives["joint"] = skeleton.passive
             self._passives["stiffness"], self._passives["damping"] = skeleton.stiffness, skeleton.damping
         self._dt = dt_s
-        self.voltage_v = voltage_v
+        self._supply_v = np.array([voltage_v])
         self._cold = np.ones(n)
         self.reset(np.zeros(n), np.zeros(n))
 
     def reset(self, q_rad: Array, load_nm: Array) -> None:
         """Put the motors to rest where their springs carry the load at the given joint positions."""
         stretch = self.springs.stretch(load_nm)
-        self._rows = np.zeros((kernel.ROWS, len(q_rad)))
-        self.state = kernel.ActuatorState(*self._rows)
+        self.rows = np.zeros((kernel.ROWS, len(q_rad)))
+        self.state = kernel.ActuatorState(*self.rows)
         self.state.motor_rad[:] = q_rad + stretch
         self.state.torque_nm[:] = self.state.elastic_nm[:] = load_nm
         self.state.deflection_rad[:] = -self.springs.deflection(stretch)
+
+    @property
+    def arrays(self) -> kernel.Motors:
+        """What the kernels know of them."""
+        return kernel.Motors(self._modules, self._passives, self._supply_v, self._dt)
+
+    @property
+    def voltage_v(self) -> float:
+        """The bus voltage, which may change between steps."""
+        return float(self._supply_v[0])
+
+    @voltage_v.setter
+    def voltage_v(self, voltage_v: float) -> None:
+        self._supply_v[0] = voltage_v
 
     def change_friction(self, module: int, factor: float) -> None:
         """Multiply the Coulomb and viscous friction of one motor and its gear."""
@@ -102,21 +116,17 @@ class Actuators:
         resistance of the warm windings over that of cold ones. The accelerations (m,) [rad/s^2, m/s^2], which
         solve M qdd = force - bias, belong to the instant of q.
         """
-        force, qdd, self._rows = kernel.advance(
-            self._modules,
-            self._passives,
-            self._rows,
+        force, qdd, self.rows = kernel.advance(
+            self.arrays,
+            self.rows,
             pwm,
             self._cold if resistance_factor is None else resistance_factor,
-            self.voltage_v,
-            GAIN_VOLTAGE_V / self.voltage_v,
-            self._dt,
             mass,
             bias,
             q,
             qd,
         )
-        self.state = kernel.ActuatorState(*self._rows)
+        self.state = kernel.ActuatorState(*self.rows)
         return force, qdd
 
 

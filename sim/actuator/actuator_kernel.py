@@ -49,6 +49,52 @@ class ActuatorState(NamedTuple):
     spring_w: Array
 
 
+class Motors(NamedTuple):
+    """The constants of n modules `MODULE` and of passive joints `PASSIVE`; bus voltage (1,), and step."""
+
+    modules: Records
+    passives: Records
+    supply_v: Array
+    dt_s: float
+
+
+class Work(NamedTuple):
+    """What a step calculates on its way, of m joints or n modules; see `drive`.
+
+    pull, added: a joint's force at qdd = 0, and by how much it falls with qdd, without end stops. force:
+    without end stops; whole: with them. momentum, inertia: of a motor over the step. stopped, stiffened: an
+    end stop's torque at qdd = 0, and by how much it falls with qdd.
+    """
+
+    pull: Array
+    added: Array
+    qdd: Array
+    force: Array
+    whole: Array
+    momentum: Array
+    inertia: Array
+    stopped: Array
+    stiffened: Array
+
+
+@compiled
+def work_of(m: int, n: int) -> Work:
+    """Return the work space for m joints and n modules."""
+    return Work(
+        np.empty(m),
+        np.empty(m),
+        np.empty(m),
+        np.empty(m),
+        np.empty(m),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+    )
+
+
+# Gains are normalised to 48 V: the duty applied is the firmware's PWM times 48 V / bus voltage.
+GAIN_VOLTAGE_V = 48.0
 # Rows of the state, as Numba knows them.
 MOTOR_RAD, MOTOR_RAD_S, TORQUE_NM, DUTY, CURRENT_A, DEFLECTION_RAD, ELASTIC_NM, RATE_RAD_S = range(8)
 ELECTRICAL_W, OUTPUT_W, COPPER_W, FRICTION_W, GEAR_W, SPRING_W = range(8, 14)
@@ -62,24 +108,27 @@ def _clamp(value: float, limit: float) -> float:
 
 @compiled
 def _solve(matrix: Array, x: Array) -> None:
-    """Solve a symmetric positive definite system in place, by Cholesky's factors; x becomes the solution."""
+    """Solve a symmetric positive definite system in place, by Cholesky's factors; x becomes the solution.
+
+    The upper triangle alone is read. Inner loops go along rows, and sums are in the order of their terms.
+    """
     m = len(x)
     for j in range(m):
-        for k in range(j):
-            matrix[j, j] -= matrix[j, k] * matrix[j, k]
         pivot = np.sqrt(matrix[j, j])
         matrix[j, j] = pivot
+        for k in range(j + 1, m):
+            matrix[j, k] /= pivot
         for i in range(j + 1, m):
-            for k in range(j):
-                matrix[i, j] -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] /= pivot
-    for i in range(m):
-        for k in range(i):
-            x[i] -= matrix[i, k] * x[k]
-        x[i] /= matrix[i, i]
+            factor = matrix[j, i]
+            for k in range(i, m):
+                matrix[i, k] -= factor * matrix[j, k]
+    for k in range(m):
+        x[k] /= matrix[k, k]
+        for i in range(k + 1, m):
+            x[i] -= matrix[k, i] * x[k]
     for i in range(m - 1, -1, -1):
         for k in range(i + 1, m):
-            x[i] -= matrix[k, i] * x[k]
+            x[i] -= matrix[i, k] * x[k]
         x[i] /= matrix[i, i]
 
 
@@ -98,49 +147,64 @@ def _spring(own: Any, stretch: float, rate: float) -> tuple[float, float, float,
 
 @compiled
 def advance(
-    modules: Records,
-    passives: Records,
+    motors: Motors,
     state: Array,
     pwm: Array,
     resistance_factor: Array,
-    voltage_v: float,
-    gain: float,
-    dt_s: float,
     mass: Array,
     bias: Array,
     q: Array,
     qd: Array,
 ) -> tuple[Array, Array, Array]:
     """Return the joints' forces (m,) for one step, their accelerations (m,), and the next state (ROWS, n)."""
-    m, n = len(q), len(modules)
-    pull, added, after = np.empty(m), np.empty(m), np.zeros((ROWS, n))
-    momentum, inertia = np.empty(n), np.empty(n)
-    stopped, stiffened = np.zeros(n), np.zeros(n)
+    m, n = len(q), len(motors.modules)
+    work, after = work_of(m, n), np.empty((ROWS, n))
+    drive(motors, state, pwm, resistance_factor, mass.copy(), bias, q, qd, work, after)
+    return work.whole, work.qdd, after
+
+
+@compiled
+def drive(
+    motors: Motors,
+    state: Array,
+    pwm: Array,
+    resistance_factor: Array,
+    matrix: Array,
+    bias: Array,
+    q: Array,
+    qd: Array,
+    w: Work,
+    after: Array,
+) -> None:
+    """Fill in forces `w.whole`, accelerations `w.qdd`, next state (ROWS, n); the mass matrix is used up."""
+    modules, passives, supply_v, dt_s = motors
+    voltage_v = supply_v[0]
+    pull, added, qdd, force, whole, momentum, inertia, stopped, stiffened = w
     for i in range(len(passives)):
         one = passives[i]
         pull[one.joint] = -(one.stiffness * q[one.joint] + one.damping * qd[one.joint])
         added[one.joint] = one.stiffness * dt_s * dt_s / 4.0 + one.damping * dt_s / 2.0
-    for i in range(n):
+    for i in range(len(modules)):
         j = modules[i].joint
-        after[DUTY, i] = _clamp(pwm[i] * gain, 1.0)
-        drive = after[DUTY, i] * voltage_v
+        after[DUTY, i] = _clamp(pwm[i] * (GAIN_VOLTAGE_V / voltage_v), 1.0)
+        drive_v = after[DUTY, i] * voltage_v
         pull[j], added[j], momentum[i], inertia[i], after[CURRENT_A, i] = _pull(
-            modules[i], state[:, i], drive, resistance_factor[i], dt_s, q[j], qd[j]
+            modules[i], state, i, drive_v, resistance_factor[i], dt_s, q[j], qd[j]
         )
         stopped[i], stiffened[i] = _stop(modules[i], q[j], qd[j], dt_s)
     # (M + diag(added)) qdd = pull - bias follows by eliminating the motors' accelerations and the torques.
-    matrix, qdd = mass.copy(), np.empty(m)
-    for j in range(m):
+    for j in range(len(q)):
         matrix[j, j] += added[j]
         qdd[j] = pull[j] - bias[j]
-    for i in range(n):
+    for i in range(len(modules)):
         j = modules[i].joint
         matrix[j, j] += stiffened[i]
         qdd[j] += stopped[i]
     _solve(matrix, qdd)
-    force = pull - added * qdd
-    whole = force.copy()
-    for i in range(n):
+    for j in range(len(q)):
+        force[j] = pull[j] - added[j] * qdd[j]
+        whole[j] = force[j]
+    for i in range(len(modules)):
         own = modules[i]
         j = own.joint
         whole[j] += stopped[i] - stiffened[i] * qdd[j]
@@ -154,8 +218,7 @@ def advance(
         share = own.coulomb_nm / limit if limit > 0.0 else 0.0
         ohm = own.resistance_ohm * resistance_factor[i]
         stretch, rate = state[MOTOR_RAD, i] - q[j], qd[j] + dt_s / 2.0 * qdd[j]
-        _account(own, ohm, voltage_v, friction, share, stretch, rate, after[:, i])
-    return whole, qdd, after
+        _account(own, ohm, voltage_v, friction, share, stretch, rate, after, i)
 
 
 @compiled
@@ -179,24 +242,31 @@ def _friction_limit(own: Any, amps: float) -> float:
 
 @compiled
 def _pull(
-    own: Any, state: Array, drive_v: float, resistance_factor: float, dt_s: float, q: float, qd: float
+    own: Any,
+    state: Array,
+    i: int,
+    drive_v: float,
+    resistance_factor: float,
+    dt_s: float,
+    q: float,
+    qd: float,
 ) -> tuple[float, float, float, float, float]:
     """Return the spring's torque at qdd = 0, by how much it falls with qdd, momentum, inertia and current.
 
     The momentum is the motor's over the step without friction and spring.
     """
-    speed = state[MOTOR_RAD_S]
+    speed = state[MOTOR_RAD_S, i]
     ohm = own.resistance_ohm * resistance_factor
     mean = (1.0 - own.loss / 2.0) * own.per_amp_nm
     drag = own.viscous_nm_s_rad + mean * own.per_amp_nm / ohm
     inertia = own.rotor_kg_m2 + dt_s / 2.0 * drag
     drive = mean * drive_v / ohm
     # The current of this instant, half a step ahead of the speed, as the last change of speed predicts.
-    amps = (drive_v - own.per_amp_nm * (2.0 * speed - state[RATE_RAD_S])) / ohm
+    amps = (drive_v - own.per_amp_nm * (2.0 * speed - state[RATE_RAD_S, i])) / ohm
     momentum = drive + (own.rotor_kg_m2 / dt_s - drag / 2.0) * speed
     # Friction as the last step's torque predicts it; only the spring's second-order term depends on it.
-    friction = _clamp(momentum - state[TORQUE_NM], _friction_limit(own, amps))
-    _, _, push, stiffness = _spring(own, state[MOTOR_RAD] - q, speed - qd)
+    friction = _clamp(momentum - state[TORQUE_NM, i], _friction_limit(own, amps))
+    _, _, push, stiffness = _spring(own, state[MOTOR_RAD, i] - q, speed - qd)
     g = stiffness * (dt_s / 4.0 + own.spring_loss_s / 2.0) * dt_s
     shrink = 1.0 / (1.0 + g / inertia)
     pull = shrink * (push + g / inertia * (drive - drag * speed - friction))
@@ -213,15 +283,16 @@ def _account(
     stretch: float,
     output_rad_s: float,
     after: Array,
+    i: int,
 ) -> None:
     """Fill in the current at the instant itself and all powers; every entry by its own law."""
-    rate = after[RATE_RAD_S]
-    amps = (after[DUTY] * voltage_v - own.per_amp_nm * rate) / ohm
+    rate = after[RATE_RAD_S, i]
+    amps = (after[DUTY, i] * voltage_v - own.per_amp_nm * rate) / ohm
     y, elastic, push, _ = _spring(own, stretch, rate - output_rad_s)
-    after[CURRENT_A], after[DEFLECTION_RAD], after[ELASTIC_NM] = amps, -y, elastic
-    after[ELECTRICAL_W] = after[DUTY] * voltage_v * amps
-    after[OUTPUT_W] = after[TORQUE_NM] * output_rad_s
-    after[COPPER_W] = amps * amps * ohm
-    after[FRICTION_W] = (coulomb_share * friction + own.viscous_nm_s_rad * rate) * rate
-    after[GEAR_W] = (own.loss / 2.0 * own.per_amp_nm * amps + (1.0 - coulomb_share) * friction) * rate
-    after[SPRING_W] = (push - elastic) * (rate - output_rad_s)
+    after[CURRENT_A, i], after[DEFLECTION_RAD, i], after[ELASTIC_NM, i] = amps, -y, elastic
+    after[ELECTRICAL_W, i] = after[DUTY, i] * voltage_v * amps
+    after[OUTPUT_W, i] = after[TORQUE_NM, i] * output_rad_s
+    after[COPPER_W, i] = amps * amps * ohm
+    after[FRICTION_W, i] = (coulomb_share * friction + own.viscous_nm_s_rad * rate) * rate
+    after[GEAR_W, i] = (own.loss / 2.0 * own.per_amp_nm * amps + (1.0 - coulomb_share) * friction) * rate
+    after[SPRING_W, i] = (push - elastic) * (rate - output_rad_s)

@@ -1,5 +1,7 @@
 """The motors' temperatures: winding, housing and body as one chain of heat capacities to the ambient air."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from module_agent.model.catalogue import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
@@ -15,16 +17,28 @@ def heat_flow(dt_s: float) -> Array:
     return read_only(np.eye(3) + dt_s * flow / np.array(CAPACITIES_J_K)[:, None])
 
 
+class Heat(NamedTuple):
+    """Temperatures above the ambient, rows winding, housing, body, (3, n) [K], and what changes them.
+
+    flow (3, 3): the temperatures after a step from those before it. kelvin_per_w: of a winding in a step.
+    """
+
+    above_k: Array
+    flow: Array
+    kelvin_per_w: float
+    ambient_c: float
+    copper_per_k: float
+
+
 @compiled
-def _warmed(above_k: Array, flow: Array, kelvin_per_w: float, heat_w: Array) -> Array:
-    n = above_k.shape[1]
-    after = np.zeros((3, n))
-    for i in range(n):
+def warm(heat: Heat, heat_w: Array) -> None:
+    """Advance the temperatures by one step in which the windings get heat (n,)."""
+    above_k, flow = heat.above_k, heat.flow
+    for i in range(above_k.shape[1]):
+        winding, housing, body = above_k[0, i], above_k[1, i], above_k[2, i]
         for r in range(3):
-            for c in range(3):
-                after[r, i] += flow[r, c] * above_k[c, i]
-        after[0, i] += kelvin_per_w * heat_w[i]
-    return after
+            above_k[r, i] = flow[r, 0] * winding + flow[r, 1] * housing + flow[r, 2] * body
+        above_k[0, i] += heat.kelvin_per_w * heat_w[i]
 
 
 class Windings:
@@ -35,12 +49,13 @@ class Windings:
 
     def __init__(self, n: int, dt_s: float, heat: float = 1.0):
         self.above_k = np.zeros((3, n))
-        self._flow = np.array(heat_flow(dt_s))
-        self._kelvin_per_w = heat * dt_s / CAPACITIES_J_K[0]
+        self.arrays = Heat(
+            self.above_k, np.array(heat_flow(dt_s)), heat * dt_s / CAPACITIES_J_K[0], AMBIENT_C, COPPER_PER_K
+        )
 
     def step(self, heat_w: Array) -> None:
         """Heat the windings with their losses (n,) for one step."""
-        self.above_k = _warmed(self.above_k, self._flow, self._kelvin_per_w, heat_w)
+        warm(self.arrays, heat_w)
 
     @property
     def winding_c(self) -> Array:

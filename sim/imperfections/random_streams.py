@@ -6,12 +6,13 @@ one kind, changes no other draw.
 
 import zlib
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sim.geometry.pose import Array
 
-_BLOCK = 512
+BLOCK = 512
 
 
 def generator(seed: int, serial: str, purpose: str) -> np.random.Generator:
@@ -20,24 +21,36 @@ def generator(seed: int, serial: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(entropy))
 
 
+class Draws(NamedTuple):
+    """Standard normal numbers drawn in advance: a block (BLOCK, modules, columns), and the next row (1,)."""
+
+    block: Array
+    next: np.ndarray[Any, np.dtype[np.int64]]
+
+
 class StandardNormals:
     """A row of independent standard normal numbers per module at a time, for one purpose.
 
-    They are drawn in blocks: a call per module and tick costs 1 us each.
+    They are drawn in blocks: a call per module and tick costs 1 us each. Kernels take rows from `draws`,
+    after `refill`.
     """
 
     def __init__(self, seed: int, serials: Sequence[str], purpose: str, columns: int):
         self._sources = [generator(seed, serial, purpose) for serial in serials]
-        self._columns = columns
-        self._next = _BLOCK
-        self._block = np.zeros((_BLOCK, len(serials), columns))
+        self.draws = Draws(np.zeros((BLOCK, len(serials), columns)), np.array([BLOCK]))
+
+    def refill(self) -> None:
+        """Draw the next block, if this one is used up."""
+        block, at = self.draws
+        if at[0] == BLOCK:
+            for module, source in enumerate(self._sources):
+                block[:, module] = source.standard_normal((BLOCK, block.shape[2]))
+            at[0] = 0
 
     def draw(self) -> Array:
         """Return the next numbers, (modules, columns)."""
-        if self._next == _BLOCK:
-            draws = [source.standard_normal((_BLOCK, self._columns)) for source in self._sources]
-            self._block = np.stack(draws, axis=1)
-            self._next = 0
-        self._next += 1
-        row: Array = self._block[self._next - 1]
+        self.refill()
+        block, at = self.draws
+        at[0] += 1
+        row: Array = block[at[0] - 1].copy()
         return row

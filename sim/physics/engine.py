@@ -12,6 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from module_agent.model.compiled import compiled
 from sim.geometry.pose import Array
 from sim.physics.skeleton import Skeleton
 
@@ -59,8 +60,19 @@ class Engine(Protocol):
         ...
 
 
+@compiled
+def integrate(q: Array, qd: Array, qdd: Array, dt_s: float, q_after: Array, qd_after: Array) -> None:
+    """Fill in the positions and velocities (m,) after a step of the given accelerations (m,)."""
+    for j in range(len(q)):
+        qd_after[j] = qd[j] + dt_s * qdd[j]
+        q_after[j] = q[j] + dt_s * qd_after[j]
+
+
 class CompiledEngine:
-    """Integrates the accelerations that come with the forces; it knows no contact."""
+    """Integrates the accelerations that come with the forces; it knows no contact.
+
+    A world's ticks do so within one kernel, see `sim.world.world_kernel`.
+    """
 
     rates = 1
 
@@ -84,8 +96,9 @@ class CompiledEngine:
 
     def step(self, force: Array, qdd: Array, biases: Array) -> tuple[Array, Array]:
         """See `Engine.step`."""
-        self._qd = self._qd + self._dt_s * qdd
-        self._q = self._q + self._dt_s * self._qd
+        before = self._q, self._qd
+        self._q, self._qd = np.empty_like(qdd), np.empty_like(qdd)
+        integrate(*before, qdd, self._dt_s, self._q, self._qd)
         return self._q, self._qd
 
     def close(self) -> None:

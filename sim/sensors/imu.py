@@ -17,6 +17,7 @@ encoder the IMU appears late by as much.
 
 from collections.abc import Sequence
 from math import exp, pi, sqrt, tan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from module_agent.model.compiled import compiled
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors, per_axis
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.imperfections.random_streams import StandardNormals
+from sim.imperfections.random_streams import Draws, StandardNormals
 
 # White noise is given as seen at this output rate.
 WHITE_RATE_HZ = 250.0
@@ -46,8 +47,36 @@ def butterworth(bandwidth_hz: float, tick_s: float) -> tuple[float, float, float
     return b, 2.0 * b, b, 2.0 * (corner**2 - 1.0) * scale, (1.0 - sqrt(2.0) * corner + corner**2) * scale
 
 
+class ImuArrays(NamedTuple):
+    """What the kernels know of n IMUs.
+
+    axes (n, 2, 3, 3), scale (n, 6), g_sensitivity (n, 3, 3), bias (n, 6): as in `SensorErrors`. per_speed
+    (n, 6): vibration per motor speed. sizes (4, 6): white noise, drift, range and step of each axis. drift
+    (n, 6): in its own standard deviations; from one reading to the next it keeps `keep` of itself and gets
+    `renew` of a new draw. filtered (4, n, 6): output, last output and the two memories of the low-pass; NaN
+    before the first tick.
+    """
+
+    taps: tuple[float, float, float, float, float]
+    jitter_ticks: float
+    axes: Array
+    scale: Array
+    g_sensitivity: Array
+    bias: Array
+    per_speed: Array
+    sizes: Array
+    keep: float
+    renew: float
+    drift: Array
+    filtered: Array
+    white: Draws
+    vibration: Draws
+    drifting: Draws
+    jitter: Draws
+
+
 class Imus:
-    """The IMUs of n modules. `advance` is called every tick if `every_tick`, else before each reading."""
+    """The IMUs of n modules: `follow_imus` goes on every tick if `every_tick`, else before each reading."""
 
     def __init__(
         self,
@@ -60,15 +89,10 @@ class Imus:
         period_s: float,
     ):
         self.every_tick = profile.imu_bandwidth_hz > 0.0 or profile.sampling_jitter_s > 0.0
-        self._filter = butterworth(profile.imu_bandwidth_hz, tick_s)
-        self._jitter_ticks = profile.sampling_jitter_s / tick_s
-        self._errors = errors
         vibration = np.array([t.vibration for t in types])[:, None] * per_axis(
             profile.vibration_rad_s, profile.vibration_m_s2
         )
-        self._vibration_per_speed = vibration / np.array([t.max_speed_rad_s for t in types])[:, None]
-        # Per axis: white noise, drift, range, step.
-        self._sizes = np.array(
+        sizes = np.array(
             [
                 sqrt(1.0 / (period_s * WHITE_RATE_HZ))
                 * per_axis(profile.gyro_white_rad_s, profile.accel_white_m_s2),
@@ -77,58 +101,47 @@ class Imus:
                 per_axis(profile.gyro_step_rad_s, profile.accel_step_m_s2),
             ]
         )
-        self._keep = exp(-period_s / profile.drift_time_s) if profile.drift_time_s else 0.0
-        self._white, self._vibration, self._drifting, self._jitter = (
+        keep = exp(-period_s / profile.drift_time_s) if profile.drift_time_s else 0.0
+        self.streams = tuple(
             StandardNormals(seed, serials, purpose, columns)
             for purpose, columns in (("imu", 6), ("vibration", 6), ("imu drift", 6), ("imu jitter", 1))
         )
-        # In units of its own deviation, which it has from the beginning.
-        self._drift = self._drifting.draw().copy()
-        # The filter's output of this tick and the last one, and its two memories.
-        self._filtered = np.zeros((0, len(types), 6))
-
-    def advance(self, gyro_rad_s: Array, specific_force_m_s2: Array) -> None:
-        """Advance the low-pass by one tick; both (n, 3) in IMU axes."""
-        if not len(self._filtered):
-            # The steady state under this input.
-            b0, _, b2, _, a2 = self._filter
-            steady = np.hstack((gyro_rad_s, specific_force_m_s2))
-            self._filtered = np.array((steady, steady, (1.0 - b0) * steady, (b2 - a2) * steady))
-        _low_pass(self._filter, gyro_rad_s, specific_force_m_s2, self._filtered)
-
-    def read(self, motor_rad_s: Array) -> Array:
-        """Return a reading of all IMUs (n, 6): gyro [rad/s], accelerometer [m/s^2].
-
-        motor_rad_s: (n,) the speeds of the modules' own motors, seen at the output.
-        """
-        errors = self._errors
-        values: Array = _read(
-            self._filtered,
-            self._jitter_ticks * self._jitter.draw()[:, 0],
-            errors.misalignment,
-            errors.imu_scale,
-            errors.g_sensitivity,
-            errors.imu_bias,
-            self._drift,
-            self._white.draw(),
-            self._vibration.draw(),
-            self._vibration_per_speed,
-            motor_rad_s,
-            self._sizes,
+        white, vibrating, drifting, jitter = (stream.draws for stream in self.streams)
+        # Copies, all writable: a kernel is compiled once for every kind of array it meets.
+        self.arrays = ImuArrays(
+            taps=butterworth(profile.imu_bandwidth_hz, tick_s),
+            jitter_ticks=profile.sampling_jitter_s / tick_s,
+            axes=np.array(errors.misalignment, order="C"),
+            scale=np.array(errors.imu_scale, order="C"),
+            g_sensitivity=np.array(errors.g_sensitivity, order="C"),
+            bias=np.array(errors.imu_bias, order="C"),
+            per_speed=vibration / np.array([t.max_speed_rad_s for t in types])[:, None],
+            sizes=sizes,
+            keep=keep,
+            renew=sqrt(1.0 - keep**2),
+            # It has its own deviation from the beginning.
+            drift=self.streams[2].draw(),
+            filtered=np.full((4, len(types), 6), np.nan),
+            white=white,
+            vibration=vibrating,
+            drifting=drifting,
+            jitter=jitter,
         )
-        self._drift = self._keep * self._drift + sqrt(1.0 - self._keep**2) * self._drifting.draw()
-        return values
 
 
 @compiled
-def _low_pass(
-    taps: tuple[float, float, float, float, float], gyro: Array, force: Array, filtered: Array
-) -> None:
-    """Transposed direct form II; `filtered` holds output, last output and the two memories, (4, n, 6)."""
-    b0, b1, b2, a1, a2 = taps
+def follow_imus(own: ImuArrays, gyro: Array, force: Array) -> None:
+    """Advance the low-pass, transposed direct form II, by one tick; both (n, 3) in IMU axes."""
+    b0, b1, b2, a1, a2 = own.taps
+    filtered = own.filtered
+    begins = filtered[0, 0, 0] != filtered[0, 0, 0]
     for i in range(gyro.shape[0]):
         for axis in range(6):
             x = gyro[i, axis] if axis < 3 else force[i, axis - 3]
+            if begins:
+                # The steady state under this input.
+                filtered[0, i, axis], filtered[1, i, axis] = x, x
+                filtered[2, i, axis], filtered[3, i, axis] = (1.0 - b0) * x, (b2 - a2) * x
             y = b0 * x + filtered[2, i, axis]
             filtered[2, i, axis] = b1 * x - a1 * y + filtered[3, i, axis]
             filtered[3, i, axis] = b2 * x - a2 * y
@@ -137,39 +150,36 @@ def _low_pass(
 
 
 @compiled
-def _read(
-    filtered: Array,
-    jitter: Array,
-    axes: Array,
-    scale: Array,
-    g_sensitivity: Array,
-    bias: Array,
-    drift: Array,
-    white: Array,
-    vibration: Array,
-    per_speed: Array,
-    speed: Array,
-    sizes: Array,
-) -> Array:
-    """Return `Imus.read`; jitter (n,) is in ticks, white, vibration and drift in standard deviations."""
-    values = np.empty(scale.shape)
-    now = np.empty(6)
-    for i in range(scale.shape[0]):
-        for k in range(6):
-            now[k] = filtered[0, i, k] + jitter[i] * (filtered[0, i, k] - filtered[1, i, k])
+def read_imus(own: ImuArrays, motor_rad_s: Array, values: Array) -> None:
+    """Fill in a reading of all IMUs (n, 6): gyro [rad/s], accelerometer [m/s^2].
+
+    motor_rad_s: (n,) the speeds of the modules' own motors, seen at the output.
+    """
+    filtered, axes, sizes, drift = own.filtered, own.axes, own.sizes, own.drift
+    at, vibration_at = own.white.next[0], own.vibration.next[0]
+    drift_at, jitter_at = own.drifting.next[0], own.jitter.next[0]
+    own.white.next[0], own.vibration.next[0] = at + 1, vibration_at + 1
+    own.drifting.next[0], own.jitter.next[0] = drift_at + 1, jitter_at + 1
+    for i in range(len(motor_rad_s)):
+        off = own.jitter_ticks * own.jitter.block[jitter_at, i, 0]
         for k in range(6):
             sensor, row = k // 3, k % 3
             value = 0.0
             for column in range(3):
-                value += axes[i, sensor, row, column] * now[3 * sensor + column]
-            value *= 1.0 + scale[i, k]
+                c = 3 * sensor + column
+                now = filtered[0, i, c] + off * (filtered[0, i, c] - filtered[1, i, c])
+                value += axes[i, sensor, row, column] * now
+            value *= 1.0 + own.scale[i, k]
             if sensor == 0:
                 for column in range(3):
-                    value += g_sensitivity[i, row, column] * now[3 + column]
-            value += bias[i, k] + sizes[1, k] * drift[i, k] + sizes[0, k] * white[i, k]
-            value += per_speed[i, k] * abs(speed[i]) * vibration[i, k]
+                    c = 3 + column
+                    now = filtered[0, i, c] + off * (filtered[0, i, c] - filtered[1, i, c])
+                    value += own.g_sensitivity[i, row, column] * now
+            white, vibration = own.white.block[at, i, k], own.vibration.block[vibration_at, i, k]
+            value += own.bias[i, k] + sizes[1, k] * drift[i, k] + sizes[0, k] * white
+            value += own.per_speed[i, k] * abs(motor_rad_s[i]) * vibration
             values[i, k] = _converted(value, sizes[2, k], sizes[3, k])
-    return values
+            drift[i, k] = own.keep * drift[i, k] + own.renew * own.drifting.block[drift_at, i, k]
 
 
 @compiled

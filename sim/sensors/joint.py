@@ -21,6 +21,7 @@ reading lags behind the torque, as if energy had been lost. (P. Dahl, A solid fr
 
 from collections.abc import Sequence
 from math import exp, pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from module_agent.model.compiled import compiled
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.imperfections.random_streams import StandardNormals
+from sim.imperfections.random_streams import Draws, StandardNormals
 
 # The share of the largest effort over which the torque's hysteresis is rounded (an assumption). With loops of
 # up to this width the reading still grows with the torque.
@@ -39,8 +40,23 @@ HYSTERESIS_ROUNDING = 0.05
 _Settings = tuple[float, float, float, float, float, float]
 
 
+class JointArrays(NamedTuple):
+    """What the kernel knows of the joint sensors of n modules.
+
+    fixed (n, 7): stiffness, effort scale and offset, white noise of the effort, half the loop's width and its
+    rounding, gear ratio. memory (n, 6): encoder reading, velocity, motor speed, torque, inner friction,
+    deflection velocity; NaN before the first reading.
+    """
+
+    settings: _Settings
+    fixed: Array
+    noise: Draws
+    jitter: Draws
+    memory: Array
+
+
 class JointSensors:
-    """The encoders, speed estimates and torque sensors of n modules; to be read every tick."""
+    """The encoders, speed estimates and torque sensors of n modules; `read_joints` reads them every tick."""
 
     def __init__(
         self,
@@ -52,9 +68,7 @@ class JointSensors:
         tick_s: float,
     ):
         effort = np.array([t.max_effort_nm for t in types])
-        # Per module: stiffness, effort scale and offset, white noise of the effort, half the loop's width and
-        # its rounding.
-        self._fixed = np.column_stack(
+        fixed = np.column_stack(
             (
                 [t.spring_nm_rad for t in types],
                 1.0 + errors.effort_scale,
@@ -62,9 +76,10 @@ class JointSensors:
                 profile.effort_white_fraction * effort,
                 profile.effort_hysteresis_fraction / 2.0 * effort,
                 HYSTERESIS_ROUNDING * effort,
+                [t.gear_ratio for t in types],
             )
         )
-        self._settings: _Settings = (
+        settings: _Settings = (
             tick_s,
             profile.position_step_rad,
             _share(profile.velocity_bandwidth_hz, tick_s),
@@ -72,37 +87,12 @@ class JointSensors:
             profile.velocity_white_rad_s,
             profile.sampling_jitter_s,
         )
-        self._noise = StandardNormals(seed, serials, "joint", 2)
-        self._jitter = StandardNormals(seed, serials, "joint jitter", 1)
-        # Columns: encoder reading, velocity, motor speed, torque, inner friction, deflection velocity.
-        self._memory = np.zeros((0, 6))
-
-    def read(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> Array:
-        """Return a reading (n, 6): position, velocity, effort, deflection, motor speed, deflection velocity.
-
-        The motor's speed is seen at the output. All arguments are (n,) and true; elastic_nm is the springs'
-        torque on the outputs.
-        """
-        if not len(self._memory):
-            # The steady state of this speed and torque.
-            tick_s, step = self._settings[:2]
-            before = q_rad - qd_rad_s * tick_s
-            counted = np.rint(before / step) * step if step else before
-            still = np.zeros_like(q_rad)
-            self._memory = np.column_stack(
-                (counted, qd_rad_s, motor_rad_s, elastic_nm, still, qd_rad_s - motor_rad_s)
-            )
-        return _read(
-            self._settings,
-            self._fixed,
-            self._noise.draw(),
-            self._jitter.draw(),
-            q_rad,
-            qd_rad_s,
-            motor_rad_s,
-            elastic_nm,
-            self._memory,
+        self.streams = (
+            StandardNormals(seed, serials, "joint", 2),
+            StandardNormals(seed, serials, "joint jitter", 1),
         )
+        noise, jitter = (stream.draws for stream in self.streams)
+        self.arrays = JointArrays(settings, fixed, noise, jitter, np.full((len(types), 6), np.nan))
 
 
 def _share(bandwidth_hz: float, tick_s: float) -> float:
@@ -120,22 +110,31 @@ def _dahl(friction_nm: float, change_nm: float, limit_nm: float, rounding_nm: fl
 
 
 @compiled
-def _read(
-    settings: _Settings,
-    fixed: Array,
-    noise: Array,
-    jitter: Array,
-    q: Array,
-    qd: Array,
-    motor: Array,
-    elastic: Array,
-    memory: Array,
-) -> Array:
-    """Return `JointSensors.read`; noise and jitter are in standard deviations, `memory` is carried on."""
-    tick_s, step, velocity_share, motor_share, velocity_white, jitter_s = settings
-    values = np.empty((q.shape[0], 6))
-    for i in range(q.shape[0]):
-        off_s = jitter_s * jitter[i, 0]
+def _settle(own: JointArrays, q: Array, qd: Array, motor: Array, elastic: Array) -> None:
+    """Fill in the memory of a steady state of this speed and torque."""
+    tick_s, step, memory = own.settings[0], own.settings[1], own.memory
+    for i in range(len(q)):
+        before = q[i] - qd[i] * tick_s
+        memory[i, 0] = np.rint(before / step) * step if step > 0.0 else before
+        memory[i, 1], memory[i, 2], memory[i, 3] = qd[i], motor[i], elastic[i]
+        memory[i, 4], memory[i, 5] = 0.0, qd[i] - motor[i]
+
+
+@compiled
+def read_joints(own: JointArrays, q: Array, qd: Array, motor: Array, elastic: Array, readings: Array) -> None:
+    """Write position, velocity, effort, deflection, motor and deflection velocity into samples (n, 17).
+
+    Arguments are (n,) and true, the motors' speeds seen at the output, elastic the springs' torques on the
+    outputs [Nm].
+    """
+    tick_s, step, velocity_share, motor_share, velocity_white, jitter_s = own.settings
+    fixed, memory, noise, jitter = own.fixed, own.memory, own.noise.block, own.jitter.block
+    at, jitter_at = own.noise.next[0], own.jitter.next[0]
+    own.noise.next[0], own.jitter.next[0] = at + 1, jitter_at + 1
+    if memory[0, 0] != memory[0, 0]:
+        _settle(own, q, qd, motor, elastic)
+    for i in range(len(q)):
+        off_s = jitter_s * jitter[jitter_at, i, 0]
         angle = q[i] + qd[i] * off_s
         if step > 0.0:
             angle = np.rint(angle / step) * step
@@ -154,9 +153,9 @@ def _read(
         memory[i, 3] = elastic[i]
         memory[i, 4] = _dahl(memory[i, 4], change, fixed[i, 4], fixed[i, 5])
         torque = elastic[i] + change * (off_s / tick_s) - memory[i, 4]
-        effort = fixed[i, 1] * torque + fixed[i, 2] + fixed[i, 3] * noise[i, 1]
-        values[i, 0], values[i, 1] = angle, velocity + velocity_white * noise[i, 0]
-        values[i, 2], values[i, 3], values[i, 4] = effort, effort / -fixed[i, 0], memory[i, 2]
+        effort = fixed[i, 1] * torque + fixed[i, 2] + fixed[i, 3] * noise[at, i, 1]
+        readings[i, 2], readings[i, 3] = angle, velocity + velocity_white * noise[at, i, 0]
+        readings[i, 4], readings[i, 5] = effort, effort / -fixed[i, 0]
+        readings[i, 6] = memory[i, 2] * fixed[i, 6]
         memory[i, 5] += velocity_share * (qd[i] - motor[i] - memory[i, 5])
-        values[i, 5] = memory[i, 5]
-    return values
+        readings[i, 16] = memory[i, 5]

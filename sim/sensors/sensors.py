@@ -1,20 +1,24 @@
 """Readings of all sensors of the modules from the true state: one sample per module and tick."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from module_agent.hardware.hardware import Readings
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.compiled import compiled
+from module_agent.model.compiled import compiled, compiled_with
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors, draw_sensor_errors
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.imperfections.random_streams import generator
-from sim.sensors.imu import Imus
-from sim.sensors.joint import JointSensors
-from sim.sensors.module_clock import ModuleClock, draw_clock, module_time
+from sim.imperfections.random_streams import BLOCK, generator
+from sim.sensors import imu, joint
+from sim.sensors.imu import ImuArrays, Imus, follow_imus, read_imus
+from sim.sensors.joint import JointArrays, JointSensors, read_joints
+from sim.sensors.module_clock import ModuleClock, draw_clock
+
+Integers = np.ndarray[Any, np.dtype[np.int64]]
+NS_PER_S = 1_000_000_000
 
 
 class Instant(NamedTuple):
@@ -35,6 +39,22 @@ class Instant(NamedTuple):
     voltage_v: float
     gyro_rad_s: Array
     specific_force_m_s2: Array
+
+
+class SensorArrays(NamedTuple):
+    """What the kernels know of the sensors of n modules.
+
+    clocks (n, 2): offsets and drifts, see `ModuleClock`. imu_values (n, 6), imu_ns (n,): the last readings of
+    the IMUs and their times. every_tick: whether the IMUs are followed between readings.
+    """
+
+    joint: JointArrays
+    imu: ImuArrays
+    clocks: Integers
+    imu_values: Array
+    imu_ns: Integers
+    imu_ticks: int
+    every_tick: bool
 
 
 class Sensors:
@@ -60,55 +80,93 @@ class Sensors:
             draw_clock(generator(seed, s, "clock"), profile) for s in serials
         )
         self.errors: SensorErrors = draw_sensor_errors(seed, serials, types, profile)
-        self._imu_ticks = imu_ticks
-        self._gear = np.array([t.gear_ratio for t in types])
         noise = seed if noise_seed is None else noise_seed
-        self._joints = JointSensors(noise, serials, types, profile, self.errors, tick_s)
-        self._imus = Imus(noise, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
-        self._imu_values = np.zeros((len(types), 6))
-        self._imu_ns = [0] * len(types)
+        joints = JointSensors(noise, serials, types, profile, self.errors, tick_s)
+        imus = Imus(noise, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
+        self._streams = (*joints.streams, *imus.streams)
+        self.arrays = SensorArrays(
+            joint=joints.arrays,
+            imu=imus.arrays,
+            clocks=np.array(self.clocks, dtype=np.int64),
+            imu_values=np.zeros((len(types), 6)),
+            imu_ns=np.zeros(len(types), dtype=np.int64),
+            imu_ticks=imu_ticks,
+            every_tick=imus.every_tick,
+        )
 
-    def imu_due(self, tick: int) -> bool:
-        """Whether `read` at this tick needs the IMU's truth of this instant."""
-        return self._imus.every_tick or tick % self._imu_ticks == 0
+    def refill(self) -> None:
+        """Draw the noise of the next ticks; kernels need it as soon as they are `used_up`."""
+        for stream in self._streams:
+            stream.refill()
 
     def read(self, tick: int, truth: Instant, readings: Readings) -> None:
         """Write one sample per module into `readings`. To be called once a tick, in order."""
-        now = [module_time(clock, truth.t_ns) for clock in self.clocks]
-        if self.imu_due(tick):
-            self._imus.advance(truth.gyro_rad_s, truth.specific_force_m_s2)
-        if tick % self._imu_ticks == 0:
-            self._imu_values = self._imus.read(truth.motor_rad_s)
-            self._imu_ns = now
-        joint = self._joints.read(truth.q_rad, truth.qd_rad_s, truth.motor_rad_s, truth.elastic_nm)
-        readings.integers[:, 0] = now
-        readings.integers[:, 1] = self._imu_ns
-        _fill(
-            readings.floats,
-            joint,
-            self._gear,
+        self.refill()
+        if imus_due(self.arrays, tick):
+            follow_imus(self.arrays.imu, truth.gyro_rad_s, truth.specific_force_m_s2)
+        read_all(
+            self.arrays,
+            tick,
+            truth.t_ns,
+            truth.q_rad,
+            truth.qd_rad_s,
+            truth.motor_rad_s,
+            truth.elastic_nm,
             truth.current_a,
             truth.winding_c,
             truth.voltage_v,
-            self._imu_values,
+            readings.floats,
+            readings.integers,
         )
 
 
-@compiled
-def _fill(
-    readings: Array,
-    joint: Array,
-    gear: Array,
+@compiled_with(imu, joint)
+def used_up(own: SensorArrays) -> bool:
+    """Return whether the noise drawn in advance of some stream is used up."""
+    joints, imus = own.joint, own.imu
+    next_row = max(joints.noise.next[0], joints.jitter.next[0], imus.white.next[0])
+    next_row = max(next_row, imus.vibration.next[0], imus.drifting.next[0], imus.jitter.next[0])
+    return bool(next_row == BLOCK)
+
+
+@compiled_with(imu, joint)
+def imus_due(own: SensorArrays, tick: int) -> bool:
+    """Return whether the IMUs are to be followed in this tick, with the truth of its instant."""
+    return own.every_tick or tick % own.imu_ticks == 0
+
+
+@compiled_with(imu, joint)
+def read_all(
+    own: SensorArrays,
+    tick: int,
+    t_ns: int,
+    q: Array,
+    qd: Array,
+    motor_rad_s: Array,
+    elastic_nm: Array,
     current_a: Array,
     winding_c: Array,
     voltage_v: float,
-    imu: Array,
+    floats: Array,
+    integers: Integers,
 ) -> None:
-    """Write the values of samples (n, 17), in the order of a sample's fields, but for its times."""
-    for i in range(joint.shape[0]):
-        for k in range(4):
-            readings[i, 2 + k] = joint[i, k]
-        readings[i, 6], readings[i, 16] = joint[i, 4] * gear[i], joint[i, 5]
-        readings[i, 7], readings[i, 8], readings[i, 9] = current_a[i], winding_c[i], voltage_v
+    """Write samples (n, 17); arguments as in `Instant`, floats and integers as in `Readings`."""
+    read_imu = tick % own.imu_ticks == 0
+    if read_imu:
+        read_imus(own.imu, motor_rad_s, own.imu_values)
+    read_joints(own.joint, q, qd, motor_rad_s, elastic_nm, floats)
+    for i in range(len(q)):
+        now_ns = _module_time(own.clocks[i, 0], own.clocks[i, 1], t_ns)
+        if read_imu:
+            own.imu_ns[i] = now_ns
+        integers[i, 0], integers[i, 1] = now_ns, own.imu_ns[i]
+        floats[i, 7], floats[i, 8], floats[i, 9] = current_a[i], winding_c[i], voltage_v
         for k in range(6):
-            readings[i, 10 + k] = imu[i, k]
+            floats[i, 10 + k] = own.imu_values[i, k]
+
+
+@compiled
+def _module_time(offset_ns: int, drift_ppb: int, world_ns: int) -> int:
+    """Return `module_time`, whose products would not fit into 64 bits after some days."""
+    seconds, rest_ns = world_ns // NS_PER_S, world_ns % NS_PER_S
+    return offset_ns + world_ns + seconds * drift_ppb + rest_ns * drift_ppb // NS_PER_S

@@ -75,10 +75,29 @@ class VirtualLoop(asyncio.BaseEventLoop):
                     continue
                 self._now_ns = entry[0]
                 entry[2]()
-            self._now_ns = until_ns
+            # What ran may have let more time pass than that.
+            self._now_ns = max(self._now_ns, until_ns)
         finally:
             for due_ns, _, call, timer in late:
                 self._push(due_ns, call, timer)
+
+    @property
+    def free_ns(self) -> int | None:
+        """How long from now on nothing is due [ns]; 0 while calls are ready, None if nothing is scheduled."""
+        if self._ready:
+            return 0
+        return self._heap[0][0] - self._now_ns if self._heap else None
+
+    def pass_ns(self, time_ns: int) -> None:
+        """Let some time pass within a call [ns], for what has done the work of later calls already.
+
+        Raises:
+            RuntimeError: something is due within it.
+        """
+        free_ns = self.free_ns
+        if time_ns and free_ns is not None and free_ns <= time_ns:
+            raise RuntimeError(f"{time_ns} ns cannot pass at once: something is due in {free_ns} ns")
+        self._now_ns += time_ns
 
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None

@@ -27,11 +27,15 @@ from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot
 from sim.virtual_time.loop import LoopScheduler, VirtualLoop
 from sim.virtual_time.network import VirtualNetwork
+from sim.virtual_time.quiet_run import QuietRun
 from sim.world.external_force import Push
 from sim.world.truth import TruthLog
 from sim.world.world import TICK_NS, World
 
 T = TypeVar("T")
+
+# The ticks of a call in which nothing else happens.
+_MANY_TICKS = 256
 
 
 class VirtualSettings(NamedTuple):
@@ -122,6 +126,7 @@ class VirtualRobot:
         self._hebi_rate_hz = settings.hebi_rate_hz
         self.hebi = None if settings.hebi_rate_hz is None else ModuleNetwork(self.world.modules)
         self._ticks = 0
+        self._run = QuietRun(self.world, self.truth, self._quiet)
         self.on_tick: list[Callable[[], None]] = []
         self._profile = settings.profile
         self._safety = settings.safety
@@ -201,14 +206,26 @@ class VirtualRobot:
         """Let all agents tick, with the loops of their modules."""
         hosts, quiet = list(self.hosts.items()), self._quiet
         busy = [place for _, host in hosts for place in host.collect()]
-        readings = self.truth.exchange(self.pwm)
-        results = quiet.run(readings, busy)
+        if self.on_tick or not self.world.can_run_ahead:
+            readings = self.truth.exchange(self.pwm)
+            results = quiet.run(readings, busy)
+        else:
+            alone = not busy and not any(host.has_work for _, host in hosts)
+            alive = [self._index[serial] for serial, _ in hosts]
+            ticks, results = self._run.run(self.pwm, alive, busy, self._ticks_alone() if alone else 1)
+            self.loop.pass_ns((ticks - 1) * TICK_NS)
+            readings = self.world.readings
         for serial, host in hosts:
             if results[self._index[serial]] != QUIET or host.has_work:
                 host.finish(readings, results)
         pwm = quiet.pwm.tolist()
         for serial, _ in hosts:
             self.pwm[self._index[serial]] = pwm[self._index[serial]]
+
+    def _ticks_alone(self) -> int:
+        """Return how many ticks there are, this one included, before anything else happens."""
+        free_ns = self.loop.free_ns
+        return _MANY_TICKS if free_ns is None else min(max(1 + (free_ns - 1) // TICK_NS, 1), _MANY_TICKS)
 
     def kill(self, serial: str) -> None:
         """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone.

@@ -21,9 +21,12 @@ from sim.imperfections.module_errors import SensorErrors
 from sim.robot.robot_file import Robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.sensors.module_clock import ModuleClock, module_time
-from sim.world.world import World
+from sim.world.world import TICK_NS, World
+from sim.world.world_kernel import keep_truth
 
 VERSION = 1
+# Rows of a `TruthLog` to begin with.
+_ROWS = 4096
 
 
 class Truth(NamedTuple):
@@ -117,28 +120,32 @@ class TruthLog:
             raise DataError(f"every {every} ticks: at least 1")
         self.modules = world.modules
         self._world = world
-        self._every = every
-        self._ticks = 0
-        self._t_ns: list[int] = []
-        self._rows: list[tuple[Array, Array, Array]] = []
+        # Ticks so far, rows so far, and every how many ticks there is a row.
+        self._counts = np.array([0, 0, every])
+        self._t_ns = np.zeros(_ROWS, dtype=np.int64)
+        self._rows = np.zeros((_ROWS, 3, len(world.modules)))
 
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Step the world, record the instant of its samples if it is due, and return its readings."""
         samples = self._world.exchange(pwm)
-        if self._ticks % self._every == 0:
-            plant = self._world.plant
-            self._t_ns.append(plant.t_ns)
-            self._rows.append((plant.q_rad, plant.qd_rad_s, plant.spring_torque_nm))
-        self._ticks += 1
+        keep_truth(self._world.plant_rows, self._world.t_ns - TICK_NS, self.begin_run(1))
         return samples
+
+    def begin_run(self, ticks: int) -> tuple[Any, ...]:
+        """Return arrays with room for so many ticks: times, rows, and counts, as `keep_truth` takes them."""
+        rows = self._counts[1] + ticks
+        if rows > len(self._t_ns):
+            self._t_ns = np.concatenate((self._t_ns, np.zeros(rows, dtype=np.int64)))
+            self._rows = np.concatenate((self._rows, np.zeros((rows, *self._rows.shape[1:]))))
+        return self._t_ns, self._rows, self._counts
 
     def motion(self) -> Motion:
         """Return what has been recorded."""
         n = len(self._world.modules)
-        stamps = np.array(self._t_ns, dtype=np.int64)
-        clocks = [[module_time(clock, t) for clock in self._world.sensors.clocks] for t in self._t_ns]
+        rows = int(self._counts[1])
+        stamps, columns = self._t_ns[:rows].copy(), self._rows[:rows].copy()
+        clocks = [[module_time(clock, t) for clock in self._world.sensors.clocks] for t in stamps.tolist()]
         clock_ns = np.array(clocks, dtype=np.int64).reshape(-1, n)
-        columns = np.array(self._rows, dtype=np.float64).reshape(-1, 3, n)
         make_read_only((stamps, clock_ns, columns))
         return Motion(
             self._world.robot.serials, stamps, clock_ns, columns[:, 0], columns[:, 1], columns[:, 2]

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from copy import copy
-from typing import NamedTuple
+from copy import deepcopy
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import Skeleton, build_skeleton
 from sim.robot.robot_file import Robot
 from sim.robot.variants import as_built
-from sim.sensors.sensors import Instant, Sensors
+from sim.sensors.sensors import Sensors
+from sim.world import world_kernel as kernel
 from sim.world.external_force import Push, check_pushed
 
 TICK_NS = 1_000_000
@@ -108,22 +109,37 @@ class World:
         self._actuators = Actuators(types, TICK_S, self.profile, variation, self._skeleton, voltage_v)
         self._tick = 0
         self.readings = Readings(len(types))
-        self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
-        self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
+        start, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
+        self._actuators.reset(robot.start_rad, load)
+        self._state = kernel.WorldArrays(
+            tree=self._tree.arrays,
+            motors=self._actuators.arrays,
+            heat=self._windings.arrays,
+            sensors=self.sensors.arrays,
+            drives=self._actuators.rows,
+            q=start,
+            qd=np.zeros_like(start),
+            ahead=np.zeros_like(start),
+            pushed=np.zeros_like(start),
+            plant=np.zeros((kernel.PLANT_ROWS, len(types))),
+            structure=start[self._passive],
+            floats=self.readings.floats,
+            integers=self.readings.integers,
+            tick_ns=TICK_NS,
+        )
+        self._plain_state = kernel.plain(self._state)
+        plant = self._state.plant
+        plant[kernel.Q_RAD], plant[kernel.PLANT_MOTOR_RAD] = robot.start_rad, self._actuators.state.motor_rad
+        plant[kernel.SPRING_NM] = load
         self._pushes: list[Push] = []
         self._acting: list[Push] = []
         self._pushes_change_ns = 0
         for one in pushes:
             self.push(one)
-        self._actuators.reset(robot.start_rad, load)
         self._physics = _checked_physics(physics, robot)
         self._body = _engine(self._physics, robot, self._skeleton)
-        self._body.begin(self._q)
-        self._rates = np.zeros((self._body.rates, len(self._q)))
-        self._rehearse(Sensors(*drawn))
-        zero = np.zeros_like(robot.start_rad)
-        q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.state.motor_rad
-        self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.state.torque_nm, structure)
+        self._body.begin(start)
+        self._rehearse()
         self.modules = tuple(
             WiredModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
         )
@@ -148,8 +164,9 @@ class World:
     @property
     def plant(self) -> Plant:
         """The true state at the instant of the last samples; at the start before the first tick."""
-        t_ns, *arrays = self._plant
-        return Plant(t_ns, *(read_only(a.copy()) for a in arrays))
+        t_ns = max(self._tick - 1, 0) * TICK_NS
+        state = self._state
+        return Plant._make((t_ns, *read_only(state.plant.copy()), read_only(state.structure.copy())))
 
     def warm(self, above_ambient_k: Array) -> None:
         """Set the modules' temperatures above the ambient: rows winding, housing, body, (3, n) [K]."""
@@ -181,9 +198,11 @@ class World:
                 f"{', '.join(self._skeleton.names)}, and a world keeps its joints"
             )
         body = _engine(self._physics, robot, skeleton)
-        body.place(self._q, self._qd)
+        body.place(self._state.q, self._state.qd)
         self._body.close()
         self.robot, self._skeleton, self._body, self._tree = robot, skeleton, body, RigidTree(skeleton)
+        self._state = self._state._replace(tree=self._tree.arrays)
+        self._plain_state = kernel.plain(self._state)
 
     def change_friction(self, serial: str, factor: float) -> None:
         """Multiply the friction of a module's motor and gear, Coulomb and viscous, from the next tick on.
@@ -218,34 +237,45 @@ class World:
 
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Advance as `step` does; return `readings`, which hold the samples until the next call."""
-        u, t_ns = self._checked(pwm), self._tick * TICK_NS
-        actuators, q, qd = self._actuators, self._q, self._qd
-        motor = actuators.state.motor_rad
-        # The integrator is a leapfrog: its velocities live half a tick before its positions. Velocity forces
-        # are those of the velocity that the last acceleration predicts for the instant of the positions.
-        self._rates[:] = qd
-        self._rates[0] += self._ahead
-        mass, biases = self._tree.mass_and_biases(q, self._rates)
-        if self._pushes:
-            biases[0] -= self._pushed(q)
-        force, qdd = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
-        drives = actuators.state
-        self._q, self._qd = self._body.step(force, qdd, biases)
-        # The velocity at this instant is the mean of the two around it, the acceleration their difference.
-        rate = (qd + self._qd) * 0.5
-        self._ahead = rate - qd
-        change = (self._qd - qd) * (1.0 / TICK_S)
-        own_q, own_rate, own_change = np.array((q, rate, change)).take(self._joints, axis=1)
-        self._plant = (
-            *(t_ns, u, drives.duty, own_q, own_rate, own_change, motor),
-            *(drives.motor_rate_rad_s, drives.torque_nm, q.take(self._passive)),
-        )
-        if self.sensors.imu_due(self._tick):
-            self._imu_readings = self._tree.imu_readings(q, rate, change)
-        self.sensors.read(self._tick, self._instant(t_ns, own_q, own_rate), self.readings)
-        self._windings.step(drives.copper_w)
+        u, state = self._checked(pwm), self._prepared()
+        if isinstance(self._body, CompiledEngine):
+            kernel.advance(state, self._tick, u)
+        else:
+            force, qdd, biases, drives = kernel.begin(state, u, self._body.rates)
+            q, qd = self._body.step(force, qdd, biases)
+            kernel.end(state, self._tick, u, q, qd, drives)
         self._tick += 1
         return self.readings
+
+    def _prepared(self) -> Any:
+        """Return the state for the kernels, with what the next tick needs: noise, and what pushes."""
+        self.sensors.refill()
+        if self._pushes:
+            self._state.pushed[:] = self._pushed(self._state.q)
+        return self._plain_state
+
+    @property
+    def plant_rows(self) -> Array:
+        """The memory of `plant`, rows as in `world_kernel`, which the next tick overwrites."""
+        return self._state.plant
+
+    @property
+    def can_run_ahead(self) -> bool:
+        """Whether a kernel can run any number of ticks: the engine is compiled, and nothing will push."""
+        return isinstance(self._body, CompiledEngine) and not self._pushes
+
+    def begin_run(self, pwm: Sequence[float]) -> tuple[Any, int, Array]:
+        """Return what `world_kernel.tick` needs for a run of ticks: state, number of the first one, its PWM.
+
+        Raises:
+            ValueError, HardwareLost: as `step`.
+        """
+        u = self._checked(pwm)
+        return self._prepared(), self._tick, u
+
+    def end_run(self, ticks: int) -> None:
+        """Go on from where so many ticks have led."""
+        self._tick += ticks
 
     def close(self) -> None:
         """End the world. May be called twice."""
@@ -278,32 +308,17 @@ class World:
             load += self._tree.joint_loads(q, body, *wrench)
         return load
 
-    def _rehearse(self, sensors: Sensors) -> None:
+    def _rehearse(self) -> None:
         """Call every function that is compiled at its first call, which would stop real time for seconds."""
-        still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
-        self._imu_readings = self._tree.imu_readings(self._q, still, still)
-        mass, biases = self._tree.mass_and_biases(self._q, self._rates)
-        self._tree.joint_loads(self._q, 0, *np.zeros((3, 3)))
-        actuators = copy(self._actuators)
-        actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
-        copy(self._windings).step(actuators.state.copper_w)
-        sensors.read(0, self._instant(0, self._q[self._joints], idle), self.readings)
-
-    def _instant(self, t_ns: int, q: Array, rate: Array) -> Instant:
-        """Return the truth for the sensors, from the modules' own joints (n,)."""
-        drives = self._actuators.state
-        return Instant(
-            t_ns=t_ns,
-            q_rad=q,
-            qd_rad_s=rate,
-            motor_rad_s=drives.motor_rate_rad_s,
-            elastic_nm=drives.elastic_nm,
-            current_a=drives.current_a,
-            winding_c=self._windings.winding_c,
-            voltage_v=self._actuators.voltage_v,
-            gyro_rad_s=self._imu_readings[0],
-            specific_force_m_s2=self._imu_readings[1],
-        )
+        self.sensors.refill()
+        state, idle = deepcopy(self._plain_state), np.zeros(len(self._joints))
+        q, qd = np.array((self._state.q, self._state.qd))
+        self._tree.joint_loads(q, 0, *np.zeros((3, 3)))
+        if isinstance(self._body, CompiledEngine):
+            kernel.advance(state, 0, idle)
+        else:
+            drives = kernel.begin(state, idle, self._body.rates)[3]
+            kernel.end(state, 0, idle, q, qd, drives)
 
 
 def _checked_physics(physics: Physics | None, robot: Robot) -> Physics:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.excitation.plan import Plan
+from module_agent.wire.feedback_rows import ROW
 from sim import simulate
 from sim.robot.robot_file import load_robot
 from sim.scoring.score import score
@@ -52,8 +53,10 @@ def _without_rows(serial: str, kind: str) -> Callable[[VirtualRobot], None]:
         def sometimes_due(now_ns: int, imu_t_ns: int) -> bool:
             return due(now_ns, imu_t_ns) and not lost(now_ns)
 
-        def sometimes_kept(row: memoryview) -> tuple[int, int] | None:
-            return None if lost(int.from_bytes(row[:8], "little")) else keep(row)
+        def sometimes_kept(rows: memoryview) -> tuple[int, int] | None:
+            each = [rows[start : start + ROW.itemsize] for start in range(0, len(rows), ROW.itemsize)]
+            kept = [row for row in each if not lost(int.from_bytes(row[:8], "little"))]
+            return keep(memoryview(b"".join(kept)))
 
         rows.due = sometimes_due  # type: ignore[method-assign]
         rows.keep = sometimes_kept  # type: ignore[method-assign]

@@ -10,6 +10,7 @@ from sim.imperfections.effects import EFFECTS
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
 from sim.imperfections.random_streams import generator
 from sim.sensors.module_clock import module_time
+from sim.sensors.sensors import imus_due
 
 FIELDS = SensorSample._fields
 IMU = FIELDS[-7:-1]
@@ -136,7 +137,8 @@ def test_the_truth_of_the_imu_is_needed_every_tick_only_by_a_chip_that_looks_bet
     bench: Any,
 ) -> None:
     due = {
-        name: [bench(noise_profile(name)).sensors.imu_due(k) for k in range(8)] for name in ("ideal", "x5")
+        name: [imus_due(bench(noise_profile(name)).sensors.arrays, k) for k in range(8)]
+        for name in ("ideal", "x5")
     }
     assert due["ideal"] == [True, False, False, False] * 2
     assert all(due["x5"])

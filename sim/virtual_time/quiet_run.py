@@ -1,0 +1,114 @@
+"""Many ticks of world and agents in one compiled call, while nothing happens but ticks.
+
+The call ends at the first tick that Python has a part in: a module is not quiet, or a batch of its feedback
+rows is complete. The rows before it wait in `QuietTicks`. A call is for no more ticks than there are before
+something else happens, a message or a timer. One call for many ticks and one for each leave the same bits.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.firmware import tick_kernel
+from module_agent.firmware.quiet_ticks import QuietTicks
+from module_agent.firmware.tick_kernel import NOT_QUIET, QUIET, ROW_DUE
+from module_agent.model.compiled import compiled_with
+from sim.geometry.pose import Array
+from sim.sensors.sensors import Integers, used_up
+from sim.world import world_kernel
+from sim.world.truth import TruthLog
+from sim.world.world import World
+from sim.world.world_kernel import keep_truth, named, tick, work_of
+
+
+class QuietRun:
+    """The ticks of a world and of the agents of its modules, n places of `quiet`, many at a time."""
+
+    def __init__(self, world: World, truth: TruthLog, quiet: QuietTicks):
+        self._world, self._truth, self._quiet = world, truth, quiet
+        self._alive = np.zeros(len(world.modules), np.uint8)
+
+    def run(self, pwm: list[float], alive: list[int], busy: list[int], most: int) -> tuple[int, list[int]]:
+        """Run at most so many ticks; return how many, and the results of the last one as `QuietTicks.run`.
+
+        `pwm` is that of the first tick; places that are not `alive` keep theirs, and end no run.
+        """
+        world, quiet = self._world, self._quiet
+        self._alive[:] = 0
+        self._alive[alive] = 1
+        state, number, u = world.begin_run(pwm)
+        ticks = _run(
+            state,
+            number,
+            most if world.can_run_ahead else 1,
+            u,
+            self._alive,
+            quiet.begin_run(busy),
+            quiet.arrays,
+            self._truth.begin_run(most),
+        )
+        world.end_run(ticks)
+        return ticks, quiet.end_run()
+
+
+@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel)
+def _run(
+    state: Any,
+    number: int,
+    most: int,
+    pwm: Array,
+    alive: NDArray[np.uint8],
+    kept: Any,
+    quiet: Any,
+    truth: Any,
+) -> int:
+    own, done = named(state), 0
+    work = work_of(own, 1)
+    next_pwm, room, held, held_rows, rows, times, results = kept
+    while True:
+        tick(own, number + done, pwm, work)
+        keep_truth(own.plant, (number + done) * own.tick_ns, truth)
+        tick_kernel.tick(own.integers, own.floats, *quiet)
+        done += 1
+        _keep_times(own.integers, times)
+        ends = _keep_rows(results, alive, rows, room, held, held_rows)
+        if ends or done >= most or used_up(own.sensors):
+            break
+        for i in range(len(pwm)):
+            if alive[i]:
+                pwm[i] = min(max(next_pwm[i], -1.0), 1.0)
+    for i in range(len(pwm)):
+        if results[i] == QUIET and held[i] > 0:
+            results[i] = ROW_DUE
+    return done
+
+
+@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel)
+def _keep_times(integers: Integers, times: Integers) -> None:
+    """Keep the modules' times in this tick and the one before, (2, n)."""
+    for i in range(integers.shape[0]):
+        times[0, i] = times[1, i]
+        times[1, i] = integers[i, 0]
+
+
+@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel)
+def _keep_rows(
+    results: NDArray[np.uint8],
+    alive: NDArray[np.uint8],
+    rows: NDArray[np.uint8],
+    room: Integers,
+    held: Integers,
+    held_rows: NDArray[np.uint8],
+) -> bool:
+    """Hold the rows of this tick; return whether Python has a part in it."""
+    ends = False
+    for i in range(len(results)):
+        if results[i] == ROW_DUE:
+            for k in range(rows.shape[1]):
+                held_rows[i, held[i], k] = rows[i, k]
+            held[i] += 1
+            ends |= held[i] >= room[i]
+        elif results[i] == NOT_QUIET and alive[i]:
+            ends = True
+    return ends
