@@ -49,6 +49,9 @@ def run(
     serve_port: Annotated[
         int, typer.Option(min=1, max=65534, help="Port of the viewer served to a browser.")
     ] = SERVE_PORT,
+    max_disk: Annotated[
+        float, typer.Option(min=1e-3, help="End, the robot stopped, when the recording has so many GB.")
+    ] = 20.0,
     resume: Annotated[bool, typer.Option(help="Continue the crashed run in --out.")] = False,
     speed: Speed = 1.0,
     report: WithReport = True,
@@ -73,6 +76,7 @@ def run(
         baseline=baseline,
         measured=tuple(measured or ()),
         report=report,
+        max_bytes=round(1e9 * max_disk),
     )
     advice = f"to resume: {resuming(context)}" if advise else ""
     with Terminal(at.quiet) as terminal:

@@ -55,11 +55,22 @@ class SessionFileError(RobotError):
     """The file is not a recording of a session; the message names it."""
 
 
-class SessionWriter:
-    """Appends entries to a new file."""
+class NotRecorded(RobotError):
+    """Nothing more can be recorded; the message says why, and what to do."""
 
-    def __init__(self, path: Path):
+
+class SessionWriter:
+    """Appends entries to a new file, of `max_bytes` at most.
+
+    When nothing more can be written, `failure` says why; what comes then is dropped, but for the journal
+    where only the limit is reached. What was written stays readable.
+    """
+
+    def __init__(self, path: Path, max_bytes: int | None = None):
         self.path = path
+        self.failure: NotRecorded | None = None
+        self._max_bytes = max_bytes
+        self._is_broken = False
         self._file = path.open("wb")
         self._flushed_ns = 0
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -69,6 +80,21 @@ class SessionWriter:
 
     def write(self, entry: Entry) -> None:
         """Append one entry."""
+        if self._is_broken or (self.failure is not None and entry.kind != "journal"):
+            return
+        try:
+            self._write(entry)
+        except OSError as error:
+            self._break(error)
+
+    def _break(self, error: OSError) -> None:
+        self._is_broken = True
+        self.failure = NotRecorded(
+            f"{self.path} cannot be written any more: {error.strerror or error}; what was recorded until "
+            "then is kept: make room, or give another --out"
+        )
+
+    def _write(self, entry: Entry) -> None:
         channel = self._channels.get((entry.kind, entry.topic))
         if channel is None:
             channel = self._register(entry.kind, entry.topic)
@@ -76,6 +102,12 @@ class SessionWriter:
         if entry.t_ns - self._flushed_ns >= FLUSH_NS:
             self.flush()
             self._flushed_ns = entry.t_ns
+            written = self._file.tell()
+            if self._max_bytes is not None and written > self._max_bytes and self.failure is None:
+                self.failure = NotRecorded(
+                    f"{self.path} has reached {self._max_bytes / 1e9:g} GB, the limit of --max-disk; what "
+                    "was recorded until then is kept"
+                )
 
     def flush(self) -> None:
         """Pass all entries so far to the operating system, so that a crash of this process keeps them."""
@@ -97,10 +129,16 @@ class SessionWriter:
         return channel
 
     def close(self) -> None:
-        """Write the index and close. May be called twice."""
-        if not self._file.closed:
-            self._writer.finish()  # type: ignore[no-untyped-call]
+        """Write the index and close. May be called twice; an error is in `failure`."""
+        if self._file.closed:
+            return
+        try:
+            if not self._is_broken:
+                self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.close()
+        except OSError as error:
+            # Closed it is all the same.
+            self._break(error)
 
 
 class _Record(NamedTuple):

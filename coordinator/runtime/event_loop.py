@@ -57,7 +57,9 @@ class ScaledLoop(asyncio.SelectorEventLoop):
 
 T = TypeVar("T")
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# A closed terminal ends a program in order, too, unless it was started to outlive it (nohup).
+_OUTLIVES_TERMINAL = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *(() if _OUTLIVES_TERMINAL else (signal.SIGHUP,)))
 
 
 def ignore_signals() -> None:

@@ -4,9 +4,9 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -87,6 +87,7 @@ class RunConfig(NamedTuple):
     only those next to a difference from that run.
     measured: folders of runs or merges with some of the modules, whose IMUs are known as well as they tell.
     report: write a page for people into the folder, of a run that ends early too.
+    max_bytes: of the recording; a run that reaches it stops the robot and ends.
     """
 
     robot: str
@@ -101,6 +102,24 @@ class RunConfig(NamedTuple):
     baseline: Path | None = None
     measured: tuple[Path, ...] = ()
     report: bool = False
+    max_bytes: int | None = None
+
+
+class _Undisturbed:
+    """A screen whose terminal may be gone: what cannot be shown must not end a session that moves a robot."""
+
+    def __init__(self, screen: Screen):
+        self._screen = screen
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """Show that a step begins."""
+        with contextlib.suppress(OSError, ValueError):
+            self._screen.step(index, total, text)
+
+    def note(self, text: str) -> None:
+        """Show a line of text."""
+        with contextlib.suppress(OSError, ValueError):
+            self._screen.note(text)
 
 
 class Run:
@@ -139,11 +158,12 @@ class Run:
             config = config._replace(plan=config.plan.model_copy(update={"mode": "simultaneous"}))
         self._config = config
         self._clock = clock
-        self._screen = screen
+        self._screen = _Undisturbed(screen)
         self._crashed = crashed
         self._started_s = time.monotonic()
         self.recording = Recording()
-        self._writer = SessionWriter(config.out / SESSION)
+        self._writer = SessionWriter(config.out / SESSION, config.max_bytes)
+        self._session: asyncio.Task[Any] | None = None
         targets = config.viewer._replace(rrd=config.out / VIEW)
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(viewer, self.recording, overlay)
@@ -169,6 +189,8 @@ class Run:
             for damage in self.recording.damage:
                 self.note(damage)
             self._writer.flush()
+            if self._writer.failure is not None:
+                raise self._writer.failure
         except BaseException:
             self._writer.close()
             self._feed.close()
@@ -177,15 +199,22 @@ class Run:
     # ------------------------------------------------------------------ recording
 
     def _record(self, entry: Entry) -> Message | None:
-        self._writer.write(entry)
+        self._write(entry)
         message = self.recording.accept(entry)
         if message is not None:
             self._feed.on_message(entry, message)
         return message
 
+    def _write(self, entry: Entry) -> None:
+        """Write an entry; where nothing can be recorded, end the session, which stops the robot first."""
+        self._writer.write(entry)
+        if self._writer.failure is not None and self._session is not None:
+            session, self._session = self._session, None
+            session.cancel(str(self._writer.failure))
+
     def _journal(self, event: JournalEvent) -> None:
         entry = Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode())
-        self._writer.write(entry)
+        self._write(entry)
         self.recording.add(entry)
         if event.what == "session":
             self._feed.begin(event.t_ns)
@@ -313,7 +342,7 @@ class Run:
                 self._single_joints if self._baseline is not None else None,
                 lambda: self._requests.collect(self._group.serials),
             )
-            await session.run(config.expect)
+            await self._recorded(session.run(config.expect))
             kinematics = await self._request_information()
             self._journal(
                 JournalEvent(
@@ -326,6 +355,8 @@ class Run:
             # Nothing more is recorded: a replay must read exactly what this result is computed from.
             self._messenger.close()
             self._writer.close()
+            if self._writer.failure is not None:
+                raise self._writer.failure
             self._screen.note("estimating")
             identified = await self._compute(
                 lambda: identify(
@@ -358,6 +389,22 @@ class Run:
                 self._screen.note(
                     f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
                 )
+
+    async def _recorded(self, session: Coroutine[None, None, None]) -> None:
+        """Await a session as long as it can be recorded.
+
+        Raises:
+            NotRecorded: it cannot any more; the session has stopped the robot.
+        """
+        self._session = asyncio.current_task()
+        try:
+            await session
+        except asyncio.CancelledError:
+            if self._writer.failure is not None:
+                raise self._writer.failure from None
+            raise
+        finally:
+            self._session = None
 
     def _write_report(self) -> None:
         """Write the report of what there is; a run does not fail for lack of one."""

@@ -14,15 +14,17 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`; what is written there takes its place if nothing was raised.
 
     Raises:
-        OSError: the file cannot be put in its place.
+        OSError: the file cannot be written or put in its place; it names the file, also of a full disk.
     """
     temporary = path.with_name(path.name + ".part")
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         if temporary.is_file():
             temporary.unlink()
+        if isinstance(error, OSError) and error.filename is None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 

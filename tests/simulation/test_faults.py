@@ -1,6 +1,8 @@
 """Agents die, cables are pulled, messages come twice or late: a run ends well or says why not."""
 
+import errno
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,9 @@ import pytest
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, UnfitLink
 from coordinator.live_robot.messenger import NoAnswer
+from coordinator.recording.recording import Entry
 from coordinator.recording.run_folder import load_recording
+from coordinator.recording.session_file import NotRecorded, SessionWriter
 from coordinator.session.session import NoModulesFound
 from module_agent.network_emulation.profile import NetworkProfile
 from sim.scoring.score import score
@@ -187,3 +191,33 @@ def test_a_run_whose_coordinator_is_killed_is_resumed_and_ends_right(
     assert [s for s in done if s != "home"] == list(dict.fromkeys(s for s in done if s != "home"))
     assert not (out / "session.crashed.mcap").exists()
     assert json.loads((out / "result.json").read_text())["serials"] == [BASE, TIP]
+
+
+class _FullDisk(SessionWriter):
+    """A recording on a disk that is full after 12 s, in the middle of a motion."""
+
+    def _write(self, entry: Entry) -> None:
+        if entry.t_ns > 12_000_000_000:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        super()._write(entry)
+
+
+@pytest.mark.parametrize(
+    ("writer", "why"),
+    [
+        (lambda path, _: _FullDisk(path), "No space left on device"),
+        (lambda path, _: SessionWriter(path, 300_000), "the limit of --max-disk"),
+    ],
+)
+def test_when_nothing_can_be_recorded_any_more_the_robot_is_stopped_and_it_is_said(
+    rigs: Rigs, quick_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writer: Any, why: str
+) -> None:
+    monkeypatch.setattr("coordinator.session.run.SessionWriter", writer)
+    rig = rigs(ARM, "lan", 1)
+    with pytest.raises(NotRecorded, match=why):
+        rig.session(tmp_path / "run", quick_plan)
+    # A stop goes out to all, though nothing is recorded of it.
+    assert {rig.state(serial) for serial in rig.serials} == {"stopped"}
+    kept = load_recording(tmp_path / "run" / "session.mcap")
+    assert not kept.damage
+    assert all(module.rows.count > 1000 for module in kept.modules.values())

@@ -189,3 +189,36 @@ def test_closing_twice_is_once(tmp_path: Path, wire: SimpleNamespace) -> None:
     size = (tmp_path / "session.mcap").stat().st_size
     writer.close()
     assert (tmp_path / "session.mcap").stat().st_size == size
+
+
+def test_a_full_disk_is_said_and_what_comes_then_is_dropped(tmp_path: Path, wire: SimpleNamespace) -> None:
+    writer = SessionWriter(Path("/dev/full"))
+    for entry in _entries(wire, 400):
+        writer.write(entry)
+    writer.close()
+    assert writer.failure is not None
+    assert "/dev/full cannot be written any more: No space left on device" in str(writer.failure)
+
+
+def test_a_recording_ends_at_its_limit_and_is_whole_up_to_there(
+    tmp_path: Path, wire: SimpleNamespace
+) -> None:
+    path = tmp_path / "session.mcap"
+    entries = _entries(wire, 2000)
+    writer = SessionWriter(path, max_bytes=20_000)
+    for entry in entries:
+        if writer.failure is None:
+            writer.write(entry)
+    # Of a session that has failed the journal says why.
+    writer.write(entries[1])
+    writer.write(wire.journal("failed", t_ns=entries[-1].t_ns, text="full"))
+    writer.close()
+    assert "the limit of --max-disk" in str(writer.failure)
+    # A chunk more, and the index.
+    assert 20_000 < path.stat().st_size < 60_000
+    damage: list[str] = []
+    read = list(read_session(path, damage.append))
+    assert not damage
+    assert read[:-1] == entries[: len(read) - 1]
+    assert 50 < len(read) < 2000
+    assert read[-1].kind == "journal"
