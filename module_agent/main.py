@@ -48,17 +48,19 @@ ATTACHED = "attached to the bus and the network"
 
 
 class Stopped(SystemExit):
-    """Raised in the main thread by SIGINT and SIGTERM, so that even a blocked tick ends cleanly."""
+    """Raised in the main thread by a signal that ends, so that even a blocked tick ends cleanly."""
 
 
-def _ignore_signals() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+def _handle_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        # What was started to outlive its terminal (nohup) does.
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def _stop(number: int, _frame: FrameType | None) -> None:
-    _ignore_signals()
-    raise Stopped(0 if number == signal.SIGTERM else 130)
+    _handle_signals(signal.SIG_IGN)
+    raise Stopped({signal.SIGTERM: 0, signal.SIGINT: 130}.get(signal.Signals(number), 128 + number))
 
 
 def _transport(
@@ -228,8 +230,7 @@ def _run(
     # Imported here: it brings the estimators, which `--help` does not need.
     from module_agent.host import AgentHost
 
-    signal.signal(signal.SIGTERM, _stop)
-    signal.signal(signal.SIGINT, _stop)
+    _handle_signals(_stop)
     # Estimates run on a second thread; a tick must not wait for it the default 5 ms.
     sys.setswitchinterval(0.0005)
     with ExitStack() as opened:
@@ -296,7 +297,7 @@ def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
     finally:
         # The end of the world is mostly followed by a signal that ends the agents too: one in the middle of
         # closing would leave the session half open, and its threads would keep the process for ever.
-        _ignore_signals()
+        _handle_signals(signal.SIG_IGN)
         host.close()
         worker.close()
 

@@ -165,23 +165,29 @@ class _ClosesUnderSignal:
     modules = ()
     closed = False
 
+    def __init__(self, number: signal.Signals):
+        self._number = number
+
     def cycle(self) -> None:
         raise HardwareLost("the world closed it")
 
     def close(self) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), self._number)
         self.closed = True
 
 
-def test_a_signal_in_the_middle_of_closing_does_not_leave_an_agent_half_closed() -> None:
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    host: Any = _ClosesUnderSignal()
-    signal.signal(signal.SIGTERM, agent_program._stop)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_in_the_middle_of_closing_does_not_leave_an_agent_half_closed(
+    number: signal.Signals,
+) -> None:
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    host: Any = _ClosesUnderSignal(number)
+    signal.signal(number, agent_program._stop)
     try:
         with pytest.raises(typer.Exit) as ended:
             agent_program._serve(host, ThreadWorker())
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for each, handler in before.items():
+            signal.signal(each, handler)
     assert host.closed
     assert ended.value.exit_code == EXIT_LOST
