@@ -100,8 +100,8 @@ def replay(
     folder = out if out is not None else session.parent
     recording, terminal = load_recording(session), Terminal()
     # Before anything is identified: where that fails this may be why.
-    for damage in recording.damage:
-        terminal.note(damage)
+    for sentence in (*recording.damage, *recording.remarks):
+        terminal.note(sentence)
     before = baseline_within(session.parent)
     revise = before.updated if before is not None else None
     identified = identify(recording, revise=revise, measured=measured_before_run(session.parent, before))

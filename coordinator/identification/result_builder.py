@@ -82,7 +82,7 @@ def build_result(
             DhPart.of(path, rows=[DhRowPart.of(row) for row in path.rows]) for path in dh_paths(fit.chain)
         ],
         dynamics=_dynamics(inertia, held_out, bodies) if inertia is not None and bodies is not None else None,
-        notes=[*kinematics.notes, *filter(None, notes)],
+        notes=[*kinematics.notes, *filter(None, notes), *recording.remarks],
         imu_places=imu_place_parts(kinematics.refinement.calibration),
         sensors=[SensorPart.of(one, summary=one.summary) for one in kinematics.findings],
         excluded=list(kinematics.excluded),

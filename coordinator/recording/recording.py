@@ -305,6 +305,19 @@ class Recording:
         return sessions[-1] if sessions else JournalEvent(t_ns=0, what="session")
 
     @property
+    def remarks(self) -> list[str]:
+        """What is not as in a run that ended in order, as sentences: its end, and unreadable messages."""
+        remarks = []
+        times = [event.t_ns for event in list(self.journal)]
+        if not any(event.what == "finished" for event in list(self.journal)):
+            after = f" after {1e-9 * (max(times) - min(times)):.1f} s" if times else ""
+            remarks.append(f"the recording ends{after}, before its run had finished")
+        if self.refused:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self.refused.items()))
+            remarks.append(f"messages were refused, and are not part of the result: {reasons}")
+        return remarks
+
+    @property
     def imu(self) -> ImuKind:
         """The prior of the IMUs, as of the latest session event."""
         return self._session_event().imu

@@ -99,13 +99,18 @@ def _has_begun(session: Path) -> bool:
 def load_recording(path: Path) -> Recording:
     """Read a recording; messages that could not be decoded are left out, as in the live session.
 
-    Damaged places are in `Recording.damage`.
+    Damaged places, and events of the journal that this version does not know, are in `Recording.damage`.
 
     Raises:
         SessionFileError: as `read_session`.
     """
-    recording = Recording()
+    recording, unknown = Recording(), 0
     for entry in read_session(path, recording.damage.append):
-        with suppress(WireError):  # counted in `recording.refused`
+        try:
             recording.add(entry)
+        except WireError:  # counted in `recording.refused`
+            unknown += entry.kind == "journal"
+    if unknown:
+        events = f"{unknown} events of the journal are" if unknown > 1 else "an event of the journal is"
+        recording.damage.append(f"{path.name}: {events} unknown to this version of the program, and left out")
     return recording

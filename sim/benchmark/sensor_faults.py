@@ -93,7 +93,7 @@ class Fault(NamedTuple):
     concerns: int = 0
 
 
-class _Kept(Recording):
+class KeptRecording(Recording):
     """A recording that keeps what it is made of."""
 
     def __init__(self) -> None:
@@ -130,11 +130,11 @@ def _robot(seed: int, stiffness_nm_rad: float) -> Robot:
 
 
 @lru_cache(maxsize=1)
-def _recorded(seed: int, plan: Plan, stiffness_nm_rad: float, imu_rate_hz: float) -> _Kept:
+def _recorded(seed: int, plan: Plan, stiffness_nm_rad: float, imu_rate_hz: float) -> KeptRecording:
     """Record a session; the faults that alter recordings have the same one."""
     robot, profile = _robot(seed, stiffness_nm_rad), noise_profile(NOISE)
     settings = VirtualSettings(robot, network("lan"), seed, profile, imu_rate_hz=imu_rate_hz)
-    recording = _Kept()
+    recording = KeptRecording()
     record_session(settings, plan, recording=recording)
     return recording
 
@@ -173,7 +173,7 @@ def softened(robot: Robot, stiffness_nm_rad: float) -> Robot:
     return robot.model_copy(update={"modules": tuple(modules)})
 
 
-def _altered(recording: _Kept, fault: Fault, ill: tuple[str, ...]) -> Recording:
+def _altered(recording: KeptRecording, fault: Fault, ill: tuple[str, ...]) -> Recording:
     if fault.alter is None:
         return recording
     (moved, *_) = [e for e in recording.latest_motions("windowed_sine") if e.serial in ill]

@@ -8,14 +8,25 @@ import numpy as np
 import pytest
 
 from coordinator.identification.identified import IdentificationError, Kinematics
-from coordinator.identification.identify import identify_kinematics
+from coordinator.identification.identify import identify, identify_kinematics
 from coordinator.identification.robot_refinement import refine_checked
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.session_file import read_session
+from module_agent.model.errors import EXIT_SUSPECT
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import ROW, Rows
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Feedback, Info
+from sim.benchmark.sick_recordings import Alteration as Alterations
+from sim.benchmark.sick_recordings import (
+    dead,
+    jumped,
+    leaping_clock,
+    not_a_number,
+    saturated,
+    silent,
+    stuck,
+)
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import link_length_m
@@ -162,6 +173,65 @@ def test_a_vertical_joints_scale_is_free_where_gyros_do_not_tell_it(
     assert free[-1] == (yaw,)
     assert kinematics.refinement.encoder_scale[yaw] == pytest.approx(-0.01, abs=5e-3)
     _covered(kinematics)
+
+
+# By what a sickness of the elbow must be called.
+SICK = {
+    "gyro_stuck": dead("gyro_rad_s", [0]),
+    "accelerometer_stuck": dead("accel_m_s2", [2]),
+    "gyro_saturated": saturated("gyro_rad_s", 0.6),
+    "encoder_stuck": stuck("position_rad", "velocity_rad_s"),
+    "encoder_jump": jumped("position_rad", 0.05),
+    "clock_jump": leaping_clock(-300_000_000),
+    "messages_missing": silent,
+}
+
+
+def _sick(run: list[Entry], alter: Alterations, serial: str) -> Recording:
+    whole = _altered(run, lambda *_: None)
+    (motion,) = [e.motion for e in whole.latest_motions("windowed_sine") if e.serial == serial]
+    assert motion is not None
+    recording = Recording()
+    for entry in alter(run, (serial,), (motion.start_row + (motion.end_row or 0)) // 2):
+        recording.accept(entry)
+    return recording
+
+
+@pytest.mark.parametrize("kind", SICK)
+def test_a_sick_module_is_named_and_the_robot_identified_without_it(run: list[Entry], kind: str) -> None:
+    found = identify(_sick(run, SICK[kind], ELBOW))
+    assert {(one.serial, one.kind) for one in found.result.sensors if one.serious} >= {(ELBOW, kind)}
+    assert found.result.excluded == [ELBOW]
+    assert found.result.suspicions
+    # The link between the others is as it would be without the elbow, and its claim holds.
+    assert found.result.serials == [YAW, LIFT]
+    _covered(found.kinematics)
+
+
+def test_readings_that_are_no_numbers_are_counted_and_the_others_used(run: list[Entry]) -> None:
+    kinematics = identify_kinematics(_sick(run, not_a_number("gyro_rad_s"), LIFT))
+    (finding,) = kinematics.findings
+    assert (finding.serial, finding.kind, finding.serious) == (LIFT, "not_finite", True)
+    assert finding.measured >= 5
+    assert kinematics.excluded == ()
+    _covered(kinematics)
+
+
+def test_a_stuck_torque_sensor_leaves_the_chain_and_takes_the_inertia(run: list[Entry]) -> None:
+    kinematics = identify_kinematics(_sick(run, stuck("effort_nm"), LIFT))
+    assert [(one.serial, one.kind) for one in kinematics.findings] == [(LIFT, "effort_stuck")]
+    assert (kinematics.excluded, kinematics.dynamic) == ((), False)
+    _covered(kinematics)
+
+
+def test_a_robot_of_which_nothing_healthy_is_left_is_refused_by_name(run: list[Entry]) -> None:
+    everyone = run
+    for serial in (YAW, LIFT, ELBOW):
+        everyone = dead("accel_m_s2", [0, 1, 2])(everyone, (serial,), 0)
+    with pytest.raises(IdentificationError, match="no other module is left") as refused:
+        identify_kinematics(_altered(everyone, lambda *_: None))
+    assert refused.value.exit_code == EXIT_SUSPECT
+    assert {one.serial for one in refused.value.findings} == {YAW, LIFT, ELBOW}
 
 
 def _relabelled(run: list[Entry], serial: str, label: str) -> list[Entry]:
