@@ -191,6 +191,8 @@ def main(
 
     with _usage_errors():
         check_chunk("robot", robot)
+        for one in serial or ():
+            check_chunk("serial", one)
         network_named(network)
         _check_expiry(expiry, hebi)
         if not hebi and not (serial and bus):

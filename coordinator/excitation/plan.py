@@ -122,10 +122,13 @@ def load_plan(path: Path) -> Plan:
     """Read a plan from a TOML file; what the file does not set keeps its default.
 
     Raises:
-        UsageError: the file cannot be read, is not TOML, or sets something unknown or out of range.
+        UsageError: the file cannot be read, is not TOML, or sets nothing, something unknown or out of range.
     """
     try:
-        return Plan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        if not table:
+            raise UsageError(f"{path} sets nothing; for the default plan give none")
+        return Plan.model_validate(table)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror or error}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -57,14 +57,17 @@ def load_network(path: Path) -> NetworkProfile:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise NetworkError(f"{path}: cannot be read: {error}") from error
-    data = {"name": path.stem} | parse_toml(text, str(path), NetworkError)
+    table = parse_toml(text, str(path), NetworkError)
+    if not table:
+        raise NetworkError(f"{path} sets nothing; for an undisturbed network give none")
+    data = {"name": path.stem} | table
     for location in (("trace",), ("to_modules", "trace"), ("to_coordinator", "trace")):
-        table = data if len(location) == 1 else data.get(location[0])
-        if isinstance(table, dict) and "trace" in table:
+        part = data if len(location) == 1 else data.get(location[0])
+        if isinstance(part, dict) and "trace" in part:
             try:
-                if not isinstance(table["trace"], str):
+                if not isinstance(part["trace"], str):
                     raise TraceError("must be the name of a CSV file")
-                table["trace"] = read_trace(path.parent / table["trace"])
+                part["trace"] = read_trace(path.parent / part["trace"])
             except TraceError as error:
                 raise NetworkError(fault_lines([(location, str(error))], text, path)) from error
     try:

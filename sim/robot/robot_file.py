@@ -264,7 +264,11 @@ def load_robot(name_or_path: str | Path) -> Robot:
             f"{name_or_path} is neither a robot file nor a shipped robot"
             f"{did_you_mean(str(name_or_path), shipped_robots())}; shipped are {', '.join(shipped_robots())}"
         )
-    return parse_robot(path.read_text(encoding="utf-8"), str(path))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise RobotFileError(f"{path} is no text: {error}") from error
+    return parse_robot(text, str(path))
 
 
 def parse_robot(text: str, name: str) -> Robot:

@@ -1,0 +1,178 @@
+"""Every file and option of the three programs, given something else: a sentence, a code, nothing made."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from coordinator.main import app as coordinator
+from module_agent.main import app as agent
+from sim.main import app as sim
+
+PROGRAMS = {"x5-coordinator": coordinator, "x5-sim": sim, "x5-agent": agent}
+ROBOT = "thesis_171_horizontal"
+# What is given in the place of a file or a folder; None is not there at all.
+CONTENTS: dict[str, bytes | None] = {
+    "missing": None,
+    "folder": b"",
+    "empty": b"",
+    "binary": bytes(range(256)) * 20,
+    "words": b"carrier pigeons\n",
+    "list.json": b"[1, 2, 3]",
+    "types.json": b'{"serials": 3, "chain": [], "robot": {"a": null}, "schema": "two"}',
+    "deep.json": b"[" * 20_000,
+    "types.toml": b'name = 3\nmodules = "many"\nrate_hz = -1\n',
+    "huge.toml": b"delay_s = 1e999\nseed = 99999999999999999999999999\nloss = nan\n",
+    "numbers.csv": b"t,q,tau\n0,nan,1\n-1,inf,x\n",
+    "robot.xml": b'<robot name="r"><link name="a"/><joint name="j" type="flying"/></robot>',
+}
+# Commands by program; BAD is the file or the folder, NEW a place for what is written.
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "x5-coordinator": (
+        "replay BAD --out NEW",
+        "report BAD --out NEW",
+        "screenshot BAD --out NEW",
+        "check BAD --out NEW",
+        "check BAD --measured BAD",
+        "payload BAD --out NEW",
+        "merge BAD BAD --out NEW",
+        "monitor BAD",
+        "excite --urdf BAD --out NEW",
+        "fit-dynamics --urdf BAD --data BAD",
+        "compensate BAD",
+        "follow BAD --motion BAD --out NEW",
+        "run --out NEW --baseline BAD",
+        "run --out NEW --measured BAD",
+        "run --out NEW --plan BAD",
+        "run --out NEW --network BAD",
+        "run --out NEW --secure BAD",
+        "list --secure BAD",
+        "stop --network BAD",
+    ),
+    "x5-sim": (
+        "run BAD --virtual --out NEW",
+        "launch BAD --out NEW",
+        "world BAD --bus NEW",
+        "show BAD",
+        "score BAD",
+        "compare-log BAD",
+        f"run {ROBOT} --virtual --out NEW --plan BAD",
+        f"run {ROBOT} --virtual --out NEW --network BAD",
+        f"run {ROBOT} --virtual --out NEW --noise BAD",
+    ),
+    "x5-agent": (
+        "--serial A --bus NEW --network BAD",
+        "--serial A --bus NEW --secure BAD",
+    ),
+}
+# Options that are nonsense; the files are not read.
+OPTIONS: dict[str, tuple[str, ...]] = {
+    "x5-coordinator": (
+        *(f"run --out NEW --speed {value}" for value in ("0", "-1", "nan", "inf", "fast")),
+        *(f"run --out NEW --expect {value}" for value in ("0", "-3", "1.5", "all")),
+        *(f"run --out NEW --seed {value}" for value in ("-1", "x", "0.5")),
+        *(f"run --out NEW --serve-port {value}" for value in ("0", "70000", "port")),
+        *(f"run --out NEW --{name} pigeons" for name in ("imu", "torque", "mode", "motions", "viewer")),
+        *(f"run --out NEW --amplitude {value}" for value in ("-1", "nan", "1e9", "x")),
+        *(f"run --out NEW --listen {value}" for value in ("x", "tcp/", "tcp/a", "tcp/127.0.0.1:99999")),
+        *(f"{name} --robot {value}" for name in ("list", "stop") for value in ("a/b", "*", "**")),
+        *(f"keys A --out NEW --days {value}" for value in ("-1", "0", "x", "1e9")),
+        "keys A/B --out NEW",
+        "keys A A/* --out NEW",
+        "run",
+        "replay",
+        "merge",
+        "levitate",
+        "run --out NEW --levitate",
+        "run --out NEW extra",
+    ),
+    "x5-sim": (
+        *(f"run {ROBOT} --virtual --out NEW --seed {value}" for value in ("-1", "x", "nan")),
+        *(f"run {ROBOT} --virtual --out NEW --speed {value}" for value in ("0", "-1", "nan", "inf")),
+        *(f"run {ROBOT} --virtual --out NEW --imu-rate-hz {value}" for value in ("0", "-5", "nan", "x")),
+        *(f"run {ROBOT} --virtual --out NEW --push {value}" for value in ("x", "1,2", "nan,nan,nan,nan")),
+        *(f"run {ROBOT} --virtual --out NEW --{name} pigeons" for name in ("physics", "with", "without")),
+        *(f"run {ROBOT} --out NEW --processes {value}" for value in ("0", "-1", "x")),
+        *(f"fleet --{name} {value}" for name in ("robots", "modules", "seconds") for value in ("-1", "x")),
+        *(f"faults --seeds {value}" for value in ("x", "5..1", "-3..-1", "1..", "")),
+        *(f"benchmark kinematics --trials {value}" for value in ("0", "-1", "x")),
+        *(f"monitoring --hours {value}" for value in ("-1", "x")),
+        "thesis --only figure9999",
+        "benchmark kinematics --only pigeons",
+        "compare-log",
+        "run",
+        "levitate",
+    ),
+    "x5-agent": (
+        *(f"--serial A --bus NEW --feedback-rate {value}" for value in ("0", "-1", "nan", "5000", "x")),
+        *(f"--serial A --bus NEW --lifetime-ms {value}" for value in ("0", "-1", "nan", "5000", "x")),
+        *(f"--serial A --bus NEW --strategy {value}" for value in ("-1", "9", "x")),
+        *(f"--serial A --bus NEW --{name} pigeons" for name in ("imu", "expiry", "network", "connect")),
+        "--serial A --bus NEW --robot a/b",
+        "--serial a/b --bus NEW",
+        "--bus NEW",
+        "--serial A",
+    ),
+}
+WITH_FILES = [
+    (program, command, content)
+    for program, commands in COMMANDS.items()
+    for command in commands
+    for content in CONTENTS
+]
+
+
+@pytest.fixture
+def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, Path], str]:
+    """Runs a command that must not work, and returns what it says."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(program: str, command: str, bad: Path) -> str:
+        before = sorted(os.walk(tmp_path))
+        new = tmp_path / "new"
+        words = [{"BAD": str(bad), "NEW": str(new)}.get(word, word) for word in command.split(" ")]
+        done = CliRunner().invoke(PROGRAMS[program], words)
+        said = done.stderr.strip()
+        where = f"{program} {command}: {said or done.stdout}"
+        assert done.exception is None or isinstance(done.exception, SystemExit), where
+        assert done.exit_code in (1, 2, 3), where
+        assert said, where
+        for word in ("Traceback", "pydantic", "KeyError", "validation error", "errors.py", "NoneType"):
+            assert word not in said, where
+        # The parser's own errors begin with how to use the command.
+        assert said.startswith("Usage:") or f"{program}: " in said, where
+        assert sorted(os.walk(tmp_path)) == before, where
+        return said
+
+    return run
+
+
+def test_there_are_at_least_200_bad_inputs() -> None:
+    assert len(WITH_FILES) + sum(map(len, OPTIONS.values())) >= 400
+
+
+@pytest.mark.parametrize(("program", "command"), [(p, c) for p in COMMANDS for c in COMMANDS[p]])
+def test_what_is_no_such_file_is_refused(
+    refused: Callable[[str, str, Path], str], tmp_path: Path, program: str, command: str
+) -> None:
+    failures = []
+    for name, content in CONTENTS.items():
+        bad = tmp_path / name
+        if name == "folder":
+            bad.mkdir()
+        elif content is not None:
+            bad.write_bytes(content)
+        try:
+            refused(program, command, bad)
+        except AssertionError as failure:
+            failures.append(f"{name}: {failure}")
+    assert not failures, "\n".join(failures)
+
+
+@pytest.mark.parametrize(("program", "command"), [(p, c) for p in OPTIONS for c in OPTIONS[p]])
+def test_nonsense_is_refused(
+    refused: Callable[[str, str, Path], str], tmp_path: Path, program: str, command: str
+) -> None:
+    refused(program, command, tmp_path / "missing")
