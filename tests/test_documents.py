@@ -31,7 +31,15 @@ from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.name: path.read_text() for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
-PAGES_WITH_COMMANDS = ["guide.md", "benchmarks.md", "security.md", "safety.md", "scale.md", "export.md"]
+PAGES_WITH_COMMANDS = [
+    "guide.md",
+    "benchmarks.md",
+    "faults.md",
+    "security.md",
+    "safety.md",
+    "scale.md",
+    "export.md",
+]
 SCRIPTS = Path(sys.executable).parent
 # What a first-time user waits for at most; each of these takes well under a minute on two cores.
 PATIENCE_S = 240

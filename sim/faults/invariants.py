@@ -1,8 +1,11 @@
 """What must hold of every session, whatever happened in it."""
 
+import json
 from pathlib import Path
 
-from coordinator.recording.run_folder import SESSION, load_recording
+from coordinator.recording.journal import excluded_modules
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import RESULT, SESSION, load_recording
 from module_agent.model.errors import RobotError
 from sim.faults.run import Ending
 from sim.faults.schedule import Schedule
@@ -15,47 +18,55 @@ RESOLUTION_MM = 2.0
 
 def check_folder(out: Path, ending: Ending) -> dict[str, str]:
     """Return violations by kind: an unreadable recording, an unbounded run, a result that is wrong."""
-    violations = {}
+    violations: dict[str, str] = {}
     if ending.name == "unbounded":
         violations["unbounded"] = ending.text
+    recording = None
     if (out / SESSION).exists():
         try:
-            damage = load_recording(out / SESSION).damage
+            recording = load_recording(out / SESSION)
         except RobotError as error:
             violations["unreadable recording"] = str(error)
         else:
-            if damage and ending.name != "lost":
-                violations["unreadable recording"] = damage[0]
-    if ending.name == "result":
-        wrong = _wrong(out)
+            if recording.damage and ending.name != "lost":
+                violations["unreadable recording"] = recording.damage[0]
+    if ending.name == "result" and recording is not None:
+        wrong = _wrong(out, recording)
         if wrong:
             violations["wrong robot"] = wrong
     return violations
 
 
-def check_cause(schedule: Schedule, ending: Ending) -> dict[str, str]:
-    """Return a violation where an ending accuses modules, and none of those that something happened to."""
-    if ending.name in ("result", "suspect", "lost", "unbounded") or not all(
-        f.of_a_module for f in schedule.faults
-    ):
-        return {}
+def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
+    """Return whether an ending accuses modules, and none of those that something happened to."""
+    if ending.name in ("result", "lost", "unbounded") or not all(f.of_a_module for f in schedule.faults):
+        return False
     serials, modules = schedule.robot.serials, len(schedule.robot.modules)
     sick = {serials[fault.module] for fault in schedule.faults}
     # The IMUs of two modules are exchanged.
     sick |= {serials[(f.module + 1) % modules] for f in schedule.faults if f.kind == "IMU swapped"}
     accused = {serial for serial in serials if serial in ending.text}
     # How many were found, and which, says which were not.
-    if not accused or accused & sick or "expected, found" in ending.text:
-        return {}
-    return {"wrong cause": f"{ending.text} (it happened to {', '.join(sorted(sick))})"}
+    return bool(accused) and not accused & sick and "expected, found" not in ending.text
 
 
-def _wrong(out: Path) -> str:
+def _wrong(out: Path, recording: Recording) -> str:
     scored = score(out)
-    if scored.topology_differences:
-        return "; ".join(scored.topology_differences)
+    unknown = _told_unknown(out, recording)
+    differences = [text for text in scored.topology_differences if not any(s in text for s in unknown)]
+    if differences:
+        return "; ".join(differences)
     for link in scored.links:
+        if link.parent in unknown or link.child in unknown:
+            continue
         error, sigma = link.link_length_error_mm, link.link_length_sigma_mm or 0.0
         if error is not None and not abs(error) <= max(SIGMAS * sigma, RESOLUTION_MM):
             return f"link {link.parent} - {link.child} is {error:+.2f} mm off, claimed sigma {sigma:.2f} mm"
     return ""
+
+
+def _told_unknown(out: Path, recording: Recording) -> set[str]:
+    """Return modules whose mounting, or what they carry, the result says it does not know."""
+    written = json.loads((out / RESULT).read_text())
+    still = {s for s in written["serials"] if any(f"joint {s} did not move" in n for n in written["notes"])}
+    return still | set(excluded_modules(recording.journal))

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
+from module_agent.model.catalogue import module_type
 from module_agent.wire.codec import decode
 from module_agent.wire.keys import KeyParts, Leaf, parse
 from module_agent.wire.messages import Ack, LeaseRequest
@@ -18,6 +19,11 @@ LIFETIME_NS = 250_000_000
 COMMANDS = (Leaf.LEASE, Leaf.MOTION, Leaf.SETPOINT, Leaf.GAINS)
 # Below this the sign of a speed is that of its noise on a springy joint [rad/s].
 SLOW_RAD_S = 0.05
+# Of a motor, seen at the output, over the speed of its type: loops overshoot their clamps. The output swings
+# about that speed on its spring.
+SPEED_MARGIN = 1.25
+# Ticks between looks at the motors' speeds, which change within tens of milliseconds.
+SPEED_TICKS = 8
 # A PWM at 48 V; no command of a module may be larger.
 MAX_PWM = 1.0
 
@@ -43,7 +49,7 @@ class PlantWitness:
         self._sent_ns: dict[str, int] = {}
         self._accepted_ns: dict[str, int] = {}
         self._stopped: set[str] = set()
-        self._askers: dict[tuple[str, int], str] = {}
+        self._askers: dict[tuple[str, str, int], str] = {}
         self._leases: dict[str, _Held] = {}
 
     def tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
@@ -78,7 +84,10 @@ class PlantWitness:
         if ack.holder is None:
             self._leases.pop(parts.serial, None)
             return
-        held, asker = self._leases.get(parts.serial), self._askers.get((parts.serial, ack.re), "?")
+        held, asker = (
+            self._leases.get(parts.serial),
+            self._askers.get((parts.serial, ack.holder, ack.re), "?"),
+        )
         if held is not None and held.boot == ack.boot and now_ns < held.until_ns and held.by != asker:
             self._note("two holders", f"module {parts.serial} is held by {held.by} and obeys {asker}")
         self._leases[parts.serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns)
@@ -89,11 +98,13 @@ class PlantWitness:
         except WireError:
             return
         # A copy of a request is no request of who copied it.
-        self._askers.setdefault((serial, request.seq), endpoint)
+        self._askers.setdefault((serial, request.sender, request.seq), endpoint)
 
     def check(self, robot: VirtualRobot) -> None:
         """Judge what the motors did in the tick that ends."""
         t_ns = robot.world.t_ns - TICK_NS
+        if t_ns % (SPEED_TICKS * TICK_NS) == 0:
+            self._check_speeds(robot)
         for k, serial in enumerate(robot.serials):
             # What the module asks its bridge for: the plant's bridge clips it.
             asked = float(robot.pwm[k])
@@ -108,6 +119,15 @@ class PlantWitness:
             late_ns = t_ns - commanded_ns - LIFETIME_NS
             if late_ns > 2 * TICK_NS:
                 self._check_off(robot, k, late_ns)
+
+    def _check_speeds(self, robot: VirtualRobot) -> None:
+        for serial, module, speed in zip(
+            robot.serials, robot.robot.modules, robot.world.plant.motor_rad_s.tolist(), strict=True
+        ):
+            limit = module_type(module.type).max_speed_rad_s
+            if not abs(speed) <= SPEED_MARGIN * limit:
+                text = f"module {serial} at {robot.world.t_ns / 1e9:.3f} s: {speed:.2f} rad/s of {limit:.2f}"
+                self._note("speed beyond the limit", text)
 
     def _check_off(self, robot: VirtualRobot, k: int, late_ns: int) -> None:
         """Judge a motor that is commanded no more: off, or braking after a stop."""

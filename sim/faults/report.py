@@ -8,12 +8,12 @@ from typing import Literal, NamedTuple, get_args
 
 from module_agent.model.errors import RobotError
 from sim.faults.fault import KINDS
-from sim.faults.invariants import check_cause, check_folder
+from sim.faults.invariants import check_folder, is_misnamed
 from sim.faults.plant_witness import PlantWitness
 from sim.faults.run import COORDINATOR, SUCCESSOR, Ending, run_schedule
 from sim.faults.schedule import Schedule, simpler
 
-Outcome = Literal["right", "suspect", "named", "stopped", "violation"]
+Outcome = Literal["right", "suspect", "named", "misnamed", "stopped", "violation"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 _WITHOUT_ERROR: dict[str, Outcome] = {"result": "right", "suspect": "suspect", "lost": "stopped"}
 # Sessions that a violation is made simpler in, at the most.
@@ -24,8 +24,9 @@ class SeedReport(NamedTuple):
     """What became of a seed.
 
     modules, network, faults: the session, so that it can be run again. kinds: of its faults.
-    outcome: the right robot with exit code 0, a result called suspect, an error with a name, stopped with its
-    coordinator killed, or a violation of an invariant.
+    outcome: the right robot with exit code 0, a result called suspect, an error that names what
+    may have happened, one that accuses a healthy module, stopped with its coordinator killed, or a violation
+    of an invariant.
     named_rightly: whether an error or a suspicion names a fault of the schedule, None without either.
     simplest: the simplest session found that violates the same invariant, None if none was looked for.
     """
@@ -74,8 +75,7 @@ def _judged(schedule: Schedule) -> SeedReport:
             ending = Ending(type(error).__name__, str(error))
             violations["traceback"] = f"{type(error).__name__}: {error}"
         violations |= witness.violations | check_folder(Path(folder) / "run", ending)
-        violations |= check_cause(schedule, ending)
-    outcome = _WITHOUT_ERROR.get(ending.name, "named")
+    outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
     serials = schedule.robot.serials
     named = any(fault.is_named(ending.text, serials) for fault in schedule.faults)
     return SeedReport(
@@ -89,7 +89,7 @@ def _judged(schedule: Schedule) -> SeedReport:
         text=ending.text,
         outcome="violation" if violations else outcome,
         violations=violations,
-        named_rightly=named if outcome in ("named", "suspect") and not violations else None,
+        named_rightly=named if outcome in ("named", "misnamed", "suspect") and not violations else None,
     )
 
 

@@ -14,8 +14,11 @@ from coordinator.identification.result import Result, write_result
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.session_file import SessionWriter
 from coordinator.session.session import Session
+from module_agent.control.gains import default_gains
 from module_agent.firmware.firmware import Answer, Firmware
 from module_agent.hardware.motor_guard import MotorGuard
+from module_agent.model.catalogue import ModuleType
+from module_agent.wire.messages import GainSet
 from sim.faults import run
 from sim.faults.report import run_seed
 from sim.faults.schedule import draw
@@ -33,6 +36,8 @@ FROZEN = 94
 STOLEN = 81
 # Messages are corrupted while joints move.
 CORRUPTED = 10
+# An encoder jumps while its joint holds its place.
+JUMPED = 30
 # Some messages arrive twice, which changes nothing.
 HARMLESS = 102
 
@@ -59,14 +64,28 @@ def test_a_module_that_takes_any_proof_gets_two_holders(monkeypatch: pytest.Monk
     assert "two holders" in found(STOLEN)
 
 
-def test_a_coordinator_that_mixes_up_its_modules_names_a_wrong_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_coordinator_that_mixes_up_its_modules_misnames_the_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     def mixed_up(error: ModuleLost, serial: str, why: str) -> None:
         other = {"X-00009": "X-00010", "X-00010": "X-00009"}[serial]
         Exception.__init__(error, f"module {other} is lost: {why}")
         error.serial = other
 
+    assert run_seed(draw(FROZEN)).outcome == "named"
     monkeypatch.setattr(ModuleLost, "__init__", mixed_up)
-    assert set(found(FROZEN)) == {"wrong cause"}
+    assert run_seed(draw(FROZEN)).outcome == "misnamed"
+
+
+def test_loops_without_a_clamp_move_a_joint_beyond_the_limit_of_its_type(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def unclamped(kind: ModuleType, strategy: int) -> GainSet:
+        gains = default_gains(kind, strategy)
+        position = gains.position.model_copy(update={"kp": 20.0, "max_output": 1e3, "min_output": -1e3})
+        velocity = gains.velocity.model_copy(update={"min_target": -1e3, "max_target": 1e3})
+        return gains.model_copy(update={"position": position, "velocity": velocity})
+
+    monkeypatch.setattr("module_agent.firmware.firmware.default_gains", unclamped)
+    assert "speed beyond the limit" in found(JUMPED)
 
 
 def test_an_agent_that_dies_of_a_message_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:

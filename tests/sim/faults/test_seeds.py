@@ -1,0 +1,23 @@
+"""Sessions with faults, judged by the truth of the plant; `x5-sim faults` runs as many as one likes."""
+
+import pytest
+
+from sim.faults.fault import KINDS
+from sim.faults.report import run_seed
+from sim.faults.schedule import draw
+
+# One or two seconds each, and together every kind of fault.
+SEEDS = (
+    *(4, 5, 6, 9, 13, 15, 16, 27, 37, 42, 45, 59, 63, 65, 73, 81, 86, 107, 110, 111),
+    *(1012, 1024, 1034, 1039, 1041, 1060, 1064, 1114, 12),
+)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_session_with_faults_violates_nothing(seed: int) -> None:
+    report = run_seed(draw(seed), shrinks=False)
+    assert report.violations == {}, f"repeat it with: x5-sim faults {report.options()}"
+
+
+def test_the_seeds_have_every_kind_of_fault() -> None:
+    assert {fault.kind for seed in SEEDS for fault in draw(seed).faults} == set(KINDS)
