@@ -24,8 +24,6 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 SURVIVORS = Path(__file__).parent / "module_agent" / "survivors.toml"
-# It holds the core as well, but takes too long to be run on every mutant.
-QUIET_TICKS = "tests/module_agent/firmware/test_quiet_ticks.py"
 KILLED, SURVIVED, NOT_CHECKED = "killed", "survived", "not checked"
 
 
@@ -60,7 +58,7 @@ def coverage() -> int:
     # The data has a place of its own: a coverage of all tests may be under way.
     environment = {**os.environ, "COVERAGE_FILE": str(ROOT / ".coverage.safety")}
     # Its own process: where coverage starts after the core is imported, definitions do not count.
-    run = [*python, "coverage", "run", "--branch", include, "-m", "pytest", *tests, QUIET_TICKS]
+    run = [*python, "coverage", "run", "--branch", include, "-m", "pytest", *tests]
     report = [*python, "coverage", "report", include, "--show-missing", "--fail-under=100", "--precision=2"]
     for command in (run, report):
         code = subprocess.call(command, cwd=ROOT, env=environment)

@@ -99,7 +99,7 @@ class Bench:
 
     def setpoint(self, position: float | None = 0.3, **changes: Any) -> Ack:
         values = {"position_rad": position, "velocity_rad_s": None, "effort_nm": None}
-        return self.ask(Leaf.SETPOINT, Setpoint(**self.head(**values, **changes)))
+        return self.ask(Leaf.SETPOINT, Setpoint(**self.head(**{**values, **changes})))
 
     def status(self) -> Status:
         payload = encode(Ask(serial="A", boot=0, seq=9, sender="me"))

@@ -101,6 +101,12 @@ def test_a_copy_of_an_older_grant_is_refused(seq: int) -> None:
     assert lease.token == 2
 
 
+def test_the_order_of_acquisitions_is_that_of_their_sender() -> None:
+    lease = held(seq=10)
+    with pytest.raises(WireError, match="me was granted 10 before it asked 5"):
+        lease.acquire(request(seq=5), 0)
+
+
 def test_a_copy_brings_no_released_lease_back() -> None:
     lease = held()
     lease.release()

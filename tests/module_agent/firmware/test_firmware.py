@@ -192,6 +192,72 @@ def test_the_same_motion_twice_is_one_motion() -> None:
     assert refused(bench.move(6), Refusal.BUSY)
 
 
+def test_a_motion_that_is_done_is_not_run_again_by_its_copy() -> None:
+    bench = Bench()
+    bench.acquire()
+    assert bench.move(5, Rest(duration_s=0.05)).accepted
+    bench.ticks(60)
+    done = bench.status().motion
+    assert bench.move(5, Rest(duration_s=0.05)).accepted
+    assert bench.firmware.state == "armed"
+    assert bench.status().motion == done
+    assert done is not None
+    assert done.outcome == "done"
+
+
+def test_a_motion_begins_where_the_joint_is_held_and_not_where_it_is_pushed_to() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.position = 0.15
+    bench.move(1, Rest(duration_s=0.01))
+    motion = bench.status().motion
+    assert motion is not None
+    assert motion.origin_rad == 0.2
+
+
+def test_a_motion_begins_where_the_joint_is_when_no_position_is_held() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.setpoint(None, velocity_rad_s=0.1)
+    bench.position = 0.15
+    bench.move(1, Rest(duration_s=0.01))
+    motion = bench.status().motion
+    assert motion is not None
+    assert motion.origin_rad == 0.15
+
+
+def test_a_setpoint_does_not_disturb_a_motion() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(1, Rest(duration_s=1.0))
+    answer = bench.setpoint()
+    assert refused(answer, Refusal.BUSY)
+    assert "setpoints are taken when it has ended" in answer.detail
+    assert bench.firmware.state == "moving"
+
+
+def test_every_expiry_is_counted_and_said() -> None:
+    bench = Bench()
+    for count in (1, 2):
+        bench.acquire()
+        bench.ticks(255)
+        status = bench.status()
+        assert (status.state, status.expiries) == ("expired", count)
+        assert status.note == "no fresh command for 250 ms"
+
+
+def test_a_clock_that_goes_back_is_said_and_is_no_expiry_of_an_idle_module() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.now -= 701 * MS
+    bench.tick()
+    assert bench.status().note == "the module's clock went back by 700 ms"
+    idle = Bench()
+    idle.now -= 701 * MS
+    idle.tick()
+    assert (idle.firmware.state, idle.status().expiries) == ("idle", 0)
+
+
 def test_a_command_for_another_boot_or_module_is_refused() -> None:
     bench = Bench()
     assert refused(bench.acquire(boot=BOOT + 1), Refusal.WRONG_BOOT)

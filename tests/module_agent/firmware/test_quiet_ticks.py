@@ -341,6 +341,46 @@ def test_compiled_quiet_ticks_and_python_ticks_are_equal_to_the_bit(
     assert repr(compiled) == repr(plain)
 
 
+STEPS: list[tuple[Any, ...]] = [
+    ("aim", 0, (0.3, None, None)),
+    ("motion", 1, WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=0.06, sigma_s=0.02)),
+    ("aim", 2, (None, 0.2, 0.5)),
+    ("ticks", 30),
+    *(("renew", k) for k in range(3)),
+    ("gains", 0, 2, ({"ki": 3.0, "kd": 0.02}, {"punch": 0.02}, {"target_lowpass": 0.3})),
+    ("ticks", 30),
+    ("sick", 0, "effort_nm", float("nan"), 3),
+    ("hot", 2, 153.0),
+    ("ticks", 20),
+    ("stop", 1),
+    ("sick", 0, "velocity_rad_s", float("inf"), 9),
+    ("ticks", 60),
+    ("clock", 2, -700),
+    *(("acquire", k) for k in range(3)),
+    ("ask", 0),
+    ("ticks", 500),
+]
+
+
+@pytest.mark.parametrize("expiry", ["motor_off", "hold", "damping"])
+def test_a_life_in_which_everything_happens_is_the_same_in_both(expiry: str) -> None:
+    """As the random lives above, in one that is always the same and takes little time."""
+    safety = (
+        Safety(position_rad=(-0.5, 0.02), at_limit=("hold", "spring"), current_a=0.1),
+        Safety(position_rad=(-0.05, 0.4), at_limit="motor_off", effort_nm=0.2),
+        UNCONFIGURED,
+    )
+    agents = [Agent(is_compiled, 3, expiry, 250.0, safety) for is_compiled in (True, False)]
+    life = Life(agents, 3)
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+    for action in STEPS:
+        life.act(action)
+    compiled, plain = (agent.everything for agent in agents)
+    assert repr(compiled) == repr(plain)
+
+
 def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     """An idle module needs its Python objects for its statuses, and for nothing else."""
     agent = Agent(True, 3, "hold", 250.0)

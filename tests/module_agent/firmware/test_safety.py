@@ -226,6 +226,16 @@ def test_a_pressed_m_stop_stays_the_reason_of_the_first_stop(action: str | None)
     assert (one.pwm == 0.0) is (action == "motor_off")
 
 
+def test_a_fault_stays_the_reason_while_an_m_stop_is_pressed() -> None:
+    one = Bench()
+    one.winding_c = 155.0
+    one.tick()
+    one.m_stop = True
+    one.ticks(3)
+    assert one.firmware.state == "fault"
+    assert "winding" in one.status().note
+
+
 def test_release_needs_no_m_stop_to_be_released() -> None:
     one = bench(m_stop="hold")
     one.acquire()
