@@ -195,7 +195,10 @@ class MotionRecord(Part):
 
 
 class Limits(Part):
-    """What the module does not exceed: positions are refused, speed and effort clamped by the loops."""
+    """What the module does not exceed: its type's limits, or narrower ones that its owner has configured.
+
+    Positions beyond them are refused; speed and effort are clamped, configured ones by the module itself.
+    """
 
     max_speed_rad_s: Positive
     max_effort_nm: Positive

@@ -236,6 +236,18 @@ def test_a_setpoint_does_not_disturb_a_motion() -> None:
     assert bench.firmware.state == "moving"
 
 
+def test_a_stream_of_setpoints_is_no_stream_of_statuses() -> None:
+    """A status comes with every change of state, and 2.5 times a second."""
+    bench = Bench()
+    bench.acquire()
+    bench.setpoint()
+    bench.tick()
+    bench.published.clear()
+    for _ in range(100):
+        bench.setpoint()
+    assert [o.leaf for o in bench.published].count(Leaf.STATUS) <= 1
+
+
 def test_every_expiry_is_counted_and_said() -> None:
     bench = Bench()
     for count in (1, 2):
