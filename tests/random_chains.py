@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coordinator.batch_estimation.imu_jacobian import Displacements, displaced_readings, kernel_motion, padded
+from coordinator.batch_estimation.imu_prediction import body_motions
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
 from coordinator.kinematics.initial_guess import own_line
 from coordinator.topology.topology import Topology
@@ -90,3 +92,12 @@ def random_positions(chain: Chain, seed: int) -> np.ndarray:
     rng = np.random.default_rng(1000 + seed)
     count = len(chain.serials)
     return rng.uniform(-1, 1, count) + rng.uniform(-0.5, 0.5, (count, count))
+
+
+def displaced(
+    chain: Chain, joints: tuple[np.ndarray, ...], some: Displacements, amounts: np.ndarray
+) -> np.ndarray:
+    """The change (n, 6, m) of all readings by displacements that vary with time, to first order."""
+    motion = kernel_motion(body_motions(chain, *joints), *joints[:2])
+    in_places = some._replace(twists=padded(some.twists))
+    return displaced_readings(chain, motion, in_places, amounts)[..., : len(joints[0])]

@@ -8,40 +8,38 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
-from coordinator.batch_estimation.link_compliance import ComplianceJacobian, JointTrack
-from module_agent.model.chain import Chain
+from coordinator.batch_estimation.imu_jacobian import Displacements
+from coordinator.batch_estimation.link_compliance import ComplianceJacobian
+from module_agent.model.chain import Array, Chain
 
 # Far more than any encoder is off; wrong gear ratios show as well.
 ENCODER_SCALE_SIGMA = 0.05
-_STEP = 1e-4
+
+JointTrack = tuple[Array, Array, Array]  # positions, velocities, accelerations, (m, n) each
 
 
 def with_encoder_scales(
     flex: ComplianceJacobian, chain: Chain, joints: JointTrack, modules: Sequence[int]
 ) -> ComplianceJacobian:
-    """Return the slopes and those by relative changes of some joints' motions about their means, in the end.
+    """Return the displacements by the links, then those by relative changes of some joints' motions.
 
     Args:
-        flex: slopes by the links' compliances, for the same samples.
+        flex: displacements by the links' compliances, for the same samples.
         chain: n joints.
         joints: positions, velocities and accelerations, (m, n) each.
-        modules: k joints whose encoders' scales are free; the true motion is 1 + scale times the measured.
+        modules: k joints whose encoders' scales are free; the true motion about its mean is 1 + scale times
+            the measured.
     """
     if not modules:
         return flex
-    still, slopes = readings_on(chain, body_motions(chain, *joints)), []
-    mean = joints[0].mean(axis=0)
+    twists = []
     for module in modules:
-        factor = np.ones(joints[0].shape[1])
-        factor[module] += _STEP
-        q, qd, qdd = mean + factor * (joints[0] - mean), factor * joints[1], factor * joints[2]
-        moved = readings_on(chain, body_motions(chain, q, qd, qdd))
-        change = [moved.gyro_rad_s - still.gyro_rad_s, moved.accel_m_s2 - still.accel_m_s2]
-        slopes.append(np.concatenate(change, axis=2).transpose(2, 0, 1) / _STEP)
+        q, qd, qdd = (signal[:, module] for signal in joints)
+        screw = np.r_[chain.axis[module], np.cross(chain.point[module], chain.axis[module])]
+        twists.append(np.concatenate([np.outer(screw, signal) for signal in (q - q.mean(), qd, qdd)]))
+    scales = Displacements(tuple(modules), (True,) * len(modules), np.array(twists))
     return ComplianceJacobian(
-        (*flex.links, *modules),
         np.append(flex.sigmas, np.full(len(modules), ENCODER_SCALE_SIGMA)),
-        np.concatenate([flex.slopes, np.array(slopes)]),
+        flex.carried.joined(scales),
         np.append(flex.taken, np.zeros(len(modules))),
     )

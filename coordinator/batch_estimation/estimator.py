@@ -18,13 +18,19 @@ from coordinator.batch_estimation.imu_calibration import (
     catalogued,
     information_between,
 )
-from coordinator.batch_estimation.imu_intrinsics import SIZE, ImuIntrinsics, mixing, read, slopes
-from coordinator.batch_estimation.imu_jacobian import imu_jacobian
-from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
+from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, read
+from coordinator.batch_estimation.imu_jacobian import displaced_readings, kernel_motion, padded
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
+from coordinator.batch_estimation.normal_equations import (
+    Expected,
+    NormalEquations,
+    Problem,
+    State,
+    normal_equations,
+)
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.chain_estimate import ChainEstimate
-from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import BIASES_ONLY, ImuPrior
@@ -49,7 +55,6 @@ MAX_LAG = 100
 # tubes of which ring, are below 7; links of 2000 Nm/rad leave 17, of 1000 Nm/rad 60.
 SYSTEMATIC = 10.0
 
-Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
@@ -106,58 +111,6 @@ class Refinement(NamedTuple):
         return information_between(self.calibration_prior, self.calibration)
 
 
-class _Problem(NamedTuple):
-    """The samples, and what is known before of the IMUs and of the links' compliances.
-
-    known: information of the IMUs' prior, over what is free of them.
-    """
-
-    data: SensorData
-    flex: ComplianceJacobian
-    calibration: ImuCalibration
-    known: Array
-
-    @property
-    def free(self) -> Mask:
-        """Which of an IMU's are estimated, (SIZE + 6,)."""
-        return self.calibration.free
-
-
-class _State(NamedTuple):
-    """Chain, every IMU's errors and placement (n, SIZE + 6), and the links' compliances."""
-
-    chain: Chain
-    own: Array
-    compliance: Array
-
-    @property
-    def imus(self) -> ImuIntrinsics:
-        return ImuIntrinsics(self.own[:, :SIZE])
-
-    @property
-    def placement(self) -> Array:
-        return self.own[:, SIZE:]
-
-
-class _Expected(NamedTuple):
-    """Predictions for the joints' motion: the bodies' (also with that of the base), ideal IMUs, residuals."""
-
-    bodies: list[BodyMotion]
-    shaken: list[BodyMotion] | None
-    ideal: ImuReadings
-    residuals: tuple[Array, Array]
-
-
-class _Normal(NamedTuple):
-    """Normal equations: pose block, nuisance block (gravity, IMU errors), coupling, right-hand sides."""
-
-    pose: Array
-    cross: Array
-    nuisance: Array
-    pose_rhs: Array
-    nuisance_rhs: Array
-
-
 def refine_chain(
     chain: Chain,
     data: SensorData,
@@ -187,26 +140,33 @@ def refine_chain(
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
     before = calibration if calibration is not None else catalogued(chain.serials, prior)
-    flex = flex if flex is not None else rigid(count, len(data.q_rad))
-    problem = _Problem(data, flex, before, before.information()[0])
-    state = _State(chain, before.mean, np.zeros(len(flex.links)))
+    flex = flex if flex is not None else rigid(len(data.q_rad))
+    carried = flex.carried._replace(twists=padded(flex.carried.twists))
+    problem = Problem(data, flex._replace(carried=carried), before, before.information()[0])
+    state = State(chain, before.mean, np.zeros(len(flex.links)))
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
     for used in range(1, ITERATIONS + 1):
         expected = _expected(problem, state)
         if used > 1:
             sigmas = [_spread(data, residual) for residual in expected.residuals]
-        step, nuisance, spectrum = _solve(_normal_equations(problem, state, expected, sigmas))
+        normal = normal_equations(problem, state, expected, expected.still, sigmas)
+        step, spectrum = _solve(normal)
+        own = normal.own_step(step)
         last = float(np.abs(spectrum.in_sigmas(step)).max(initial=0.0)) / CONVERGED_SIGMAS
-        if expected.shaken is not None:
-            shaken = expected._replace(bodies=expected.shaken)
-            unknown = _along_unknown(_normal_equations(problem, state, shaken, sigmas), spectrum)
+        if expected.shaken is not None and not spectrum.known.all():
+            unknown = _along_unknown(problem, state, expected, sigmas, spectrum)
             last = max(last, float(np.abs(unknown).max()) / CONVERGED_UNKNOWN)
-            step += unknown
-        state = _moved(problem, state, step, nuisance)
+            step[: len(unknown)] += unknown
+        state = _moved(problem, state, step, own)
         if used > 2 and last < 1.0:
             break
-    expected = _expected(problem, state)
+    return _concluded(problem, state, noise)
+
+
+def _concluded(problem: Problem, state: State, noise: Array | None) -> Refinement:
+    """Return the estimate and what the residuals tell of it."""
+    data, expected = problem.data, _expected(problem, state)
     white = [_spread(data, residual) for residual in expected.residuals]
     # Systematic errors repeat with the motion: their samples are not independent.
     believed = [
@@ -221,12 +181,10 @@ def refine_chain(
             np.where(spread > SYSTEMATIC * size, spread * whole, wide)
             for spread, size, wide in zip(white, noise, believed, strict=True)
         ]
-    normal = _normal_equations(problem, state, expected, believed)
-    spectrum = _solve(normal)[2]
-    by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
+    normal = normal_equations(problem, state, expected, expected.still, believed)
+    by_noise = _reduced(normal_equations(problem, state, expected, expected.still, white))[0]
     rms = [_rms(residual) for residual in expected.residuals]
-    nuisance = _nuisance_covariance(normal, spectrum)
-    refined = _report(problem, state, spectrum, nuisance, by_noise, rms, white, scale)
+    refined = _report(problem, state, normal, by_noise, rms, white, scale)
     return refined._replace(columns=_columns(data, expected.residuals))
 
 
@@ -244,7 +202,7 @@ def with_placement(chain: Chain, placement: Array) -> Chain:
     return chain._replace(imu_home=frozen(chain.imu_home @ moved))
 
 
-def _pull(problem: _Problem, state: _State) -> float:
+def _pull(problem: Problem, state: State) -> float:
     """Return the rms of the links' estimates, in standard deviations of their priors.
 
     Where residuals are systematic, what the model lacks goes also into lengths and compliances, and the
@@ -256,34 +214,42 @@ def _pull(problem: _Problem, state: _State) -> float:
     return float(np.sqrt(np.mean(pulls**2))) if pulls.size else 0.0
 
 
-def _nuisance_covariance(normal: _Normal, spectrum: "_Spectrum") -> Array:
-    """Return the covariance of the nuisance parameters."""
+def _shared_covariance(normal: NormalEquations, spectrum: "_Spectrum") -> Array:
+    """Return the covariance of all poses (6 n), gravity and links; zero along what is unknown."""
     inverse = np.linalg.inv(normal.nuisance)
     kept = spectrum.vectors[:, spectrum.known] * spectrum.sigmas[spectrum.known]
-    by_poses = inverse @ (normal.cross.T @ kept)
-    return np.asarray(inverse + by_poses @ by_poses.T)
+    by_poses = -inverse @ (normal.cross.T @ kept)
+    half = np.concatenate([np.zeros((6, kept.shape[1])), kept, by_poses])
+    covariance = half @ half.T
+    rest = slice(6 + len(kept), None)
+    covariance[rest, rest] += inverse
+    return np.asarray(covariance)
 
 
-def _posterior(problem: _Problem, state: _State, nuisance: Array) -> ImuCalibration:
+def _posterior(problem: Problem, state: State, own: Array) -> ImuCalibration:
     """Return the IMUs as estimated; the prior's covariance, which is zero, where they are not free."""
     before = problem.calibration
     rows = np.flatnonzero(np.tile(problem.free, len(before.serials)))
-    own = len(nuisance) - len(rows)
     covariance = np.zeros(before.covariance.shape)
-    covariance[np.ix_(rows, rows)] = nuisance[own:, own:]
+    covariance[np.ix_(rows, rows)] = own
     return ImuCalibration(before.serials, frozen(state.own), frozen(covariance))
 
 
-def _expected(problem: _Problem, state: _State) -> _Expected:
-    data, chain, base = problem.data, with_placement(state.chain, state.placement), problem.data.base
+def _expected(problem: Problem, state: State) -> Expected:
+    data, base = problem.data, problem.data.base
+    chain = with_placement(state.chain, state.placement)
     bodies = body_motions(chain, *data.smooth)
-    shaken = None if base is None else body_motions(chain, *data.smooth, base)
+    still = kernel_motion(bodies, *data.smooth[:2])
+    shaken = (
+        None if base is None else kernel_motion(body_motions(chain, *data.smooth, base), *data.smooth[:2])
+    )
     carried = readings_on(chain, body_motions(chain, *data.joints, base))
-    given = np.tensordot(state.compliance, problem.flex.slopes, axes=1).transpose(1, 2, 0)
-    true = carried.gyro_rad_s + given[..., :3], carried.accel_m_s2 + given[..., 3:]
+    change = displaced_readings(chain, still, problem.flex.carried, state.compliance)
+    change = change[..., : len(data.q_rad)].transpose(2, 0, 1)
+    true = carried.gyro_rad_s + change[..., :3], carried.accel_m_s2 + change[..., 3:]
     gyro, accel = read(state.imus, *true, data.imu_rates)
     residuals = data.gyro_rad_s - gyro, data.accel_m_s2 - accel
-    return _Expected(bodies, shaken, readings_on(chain, bodies), residuals)
+    return Expected(chain, still, shaken, readings_on(chain, bodies), residuals)
 
 
 def _rms(residual: Array) -> Array:
@@ -310,65 +276,6 @@ def _repeats(data: SensorData, residual: Array) -> Array:
     return np.stack([np.sqrt(samples_per_independent(part, MAX_LAG, MIN_RMS)) for part in parts])
 
 
-def _normal_equations(
-    problem: _Problem, state: _State, expected: _Expected, sigmas: Sequence[Array]
-) -> _Normal:
-    """Build the weighted normal equations, IMU by IMU; the root stays."""
-    data, flex, ideal = problem.data, problem.flex, expected.ideal
-    free, placed = np.split(problem.free, [SIZE])
-    chain = with_placement(state.chain, state.placement)
-    count, samples = len(state.chain.serials), len(data.q_rad)
-    poses = 6 * count
-    information, rhs = _before(problem, state)
-    motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
-    for k in range(count):
-        jacobian, mixed = imu_jacobian(chain, expected.bodies, *data.smooth[:2], k), mixing(state.imus, k)
-        true = mixed @ np.concatenate([jacobian.poses, jacobian.gravity, flex.slopes[..., k]])
-        rates = None if data.imu_rates is None else data.imu_rates[:, k]
-        own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
-        weight = 1.0 / np.repeat([sigma[:, k] for sigma in sigmas], 3, axis=0)[:, motion]
-        rows = (np.concatenate([true, own, mixed @ jacobian.placement[placed]]) * weight).reshape(
-            -1, 6 * samples
-        )
-        target = (np.concatenate([part[:, k] for part in expected.residuals], axis=1).T * weight).ravel()
-        at = _places(jacobian.modules, k, count, len(flex.links), int(problem.free.sum()))
-        information[np.ix_(at, at)] += rows @ rows.T
-        rhs[at] += rows @ target
-    nuisance = information[poses:, poses:]
-    return _Normal(
-        information[6:poses, 6:poses], information[6:poses, poses:], nuisance, rhs[6:poses], rhs[poses:]
-    )
-
-
-def _before(problem: _Problem, state: _State) -> tuple[Array, Array]:
-    """Return the information on [perturbations (6 n), gravity (3), compliances, what is free of the IMUs].
-
-    Gravity's magnitude makes the accelerometers' scales observable.
-    """
-    count, flex = len(state.chain.serials), problem.flex
-    first = 6 * count + 3
-    links, own = slice(first, first + len(flex.links)), first + len(flex.links)
-    information = np.zeros((own + len(problem.known), own + len(problem.known)))
-    rhs = np.zeros(len(information))
-    information[links, links] = np.diag(flex.sigmas**-2.0)
-    rhs[links] = -(flex.sigmas**-2.0) * (state.compliance + flex.taken)
-    information[own:, own:] = problem.known
-    rhs[own:] = problem.known @ (problem.calibration.mean - state.own)[:, problem.free].ravel()
-    size = float(np.linalg.norm(state.chain.gravity))
-    up, at = state.chain.gravity / size, slice(6 * count, 6 * count + 3)
-    information[at, at] += np.outer(up, up) / GRAVITY_SIGMA_M_S2**2
-    rhs[at] += up * (GRAVITY_M_S2 - size) / GRAVITY_SIGMA_M_S2**2
-    return information, rhs
-
-
-def _places(modules: Sequence[int], imu: int, count: int, links: int, size: int) -> Index:
-    """Return the indices of the parameters that one IMU depends on, in the order of its slopes."""
-    perturbations = [6 * module + np.arange(6) for module in modules]
-    shared = 6 * count + np.arange(3 + links)
-    own = 6 * count + 3 + links + size * imu + np.arange(size)
-    return np.concatenate([*perturbations, shared, own])
-
-
 class _Spectrum(NamedTuple):
     """Eigenvectors (columns) of the pose information with the nuisance taken out; the sigmas along them."""
 
@@ -380,11 +287,13 @@ class _Spectrum(NamedTuple):
         return self.sigmas <= UNKNOWN_ABOVE
 
     def in_sigmas(self, step: Array) -> Array:
-        """Return a step (6 n,) along what is known, in standard deviations."""
-        return np.asarray(self.vectors[:, self.known].T @ step[6:] / self.sigmas[self.known])
+        """Return a step of all poses (6 n) and more along what is known, in standard deviations."""
+        return np.asarray(
+            self.vectors[:, self.known].T @ step[6 : 6 + len(self.vectors)] / self.sigmas[self.known]
+        )
 
 
-def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
+def _reduced(normal: NormalEquations) -> tuple[Array, Array, Array]:
     """Eliminate the nuisance: return information and right-hand side of the poses, and the elimination."""
     sides = np.column_stack([normal.cross.T, normal.nuisance_rhs])
     through: Array = np.linalg.solve(normal.nuisance, sides).astype(np.float64)
@@ -392,8 +301,8 @@ def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
     return information, normal.pose_rhs - normal.cross @ through[:, -1], through
 
 
-def _solve(normal: _Normal) -> tuple[Array, Array, _Spectrum]:
-    """Return the steps of all modules (6 n,), zero where unresolved, and of the nuisance; the spectrum."""
+def _solve(normal: NormalEquations) -> tuple[Array, _Spectrum]:
+    """Return the step of all poses (6 n), zero where unresolved, and of the nuisance; the spectrum."""
     information, rhs, through = _reduced(normal)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     with np.errstate(divide="ignore"):
@@ -402,35 +311,37 @@ def _solve(normal: _Normal) -> tuple[Array, Array, _Spectrum]:
     kept = spectrum.vectors[:, spectrum.known]
     step = kept @ (spectrum.sigmas[spectrum.known] ** 2 * (kept.T @ rhs))
     nuisance = through[:, -1] - through[:, :-1] @ step
-    return np.concatenate([np.zeros(6), step]), nuisance, spectrum
+    return np.concatenate([np.zeros(6), step, nuisance]), spectrum
 
 
-def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
+def _along_unknown(
+    problem: Problem, state: State, expected: Expected, sigmas: Sequence[Array], spectrum: "_Spectrum"
+) -> Array:
     """Return the step (6 n,) by the base's motion, along what the joints' motions do not resolve."""
+    assert expected.shaken is not None
+    hidden = spectrum.vectors[:, ~spectrum.known]
+    unknown = np.concatenate([np.zeros((6, hidden.shape[1])), hidden])
+    normal = normal_equations(problem, state, expected, expected.shaken, sigmas, unknown)
     information, rhs, _ = _reduced(normal)
-    unknown = spectrum.vectors[:, ~spectrum.known]
-    information, rhs = unknown.T @ information @ unknown, unknown.T @ rhs
     step = np.linalg.solve(information + np.eye(len(rhs)) * MAX_STEP**-2.0, rhs)
-    return np.concatenate([np.zeros(6), unknown @ np.clip(step, -MAX_STEP, MAX_STEP)])
+    return np.asarray(unknown @ np.clip(step, -MAX_STEP, MAX_STEP))
 
 
-def _moved(problem: _Problem, state: _State, step: Array, nuisance: Array) -> _State:
+def _moved(problem: Problem, state: State, step: Array, own: Array) -> State:
+    """Return the state after a step of poses (6 n), gravity and links, and of the IMUs' own."""
     change = np.zeros_like(state.own)
-    links = 3 + len(state.compliance)
-    change[:, problem.free] = nuisance[links:].reshape(len(change), -1)
-    chain = apply_perturbation(state.chain, step)
-    return _State(
-        chain._replace(gravity=frozen(chain.gravity + nuisance[:3])),
-        state.own + change,
-        state.compliance + nuisance[3:links],
+    change[:, problem.free] = own.reshape(len(change), -1)
+    poses, gravity, links = np.split(step, 6 * len(change) + np.array([0, 3]))
+    chain = apply_perturbation(state.chain, poses)
+    return State(
+        chain._replace(gravity=frozen(chain.gravity + gravity)), state.own + change, state.compliance + links
     )
 
 
 def _report(
-    problem: _Problem,
-    state: _State,
-    spectrum: _Spectrum,
-    nuisance: Array,
+    problem: Problem,
+    state: State,
+    normal: NormalEquations,
     by_noise: Array,
     rms: Sequence[Array],
     by_motion: Sequence[Array],
@@ -438,10 +349,12 @@ def _report(
 ) -> Refinement:
     """Return the estimate.
 
-    nuisance: the covariance of the nuisance parameters. rms, by_motion: of the residuals, altogether (n,)
-    and in every motion (k, n), of gyro and accelerometer. scale: of the standard deviations of poses and
-    links.
+    by_noise: information (6 n - 6,) squared on the poses by the sensors' noise alone. rms, by_motion: of the
+    residuals, altogether (n,) and in every motion (k, n), of gyro and accelerometer. scale: of the standard
+    deviations of poses and links.
     """
+    spectrum = _solve(normal)[1]
+    shared = _shared_covariance(normal, spectrum)
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
@@ -451,7 +364,7 @@ def _report(
     unknown = np.zeros((size, int(np.count_nonzero(~known))))
     unknown[6:] = spectrum.vectors[:, ~known]
     sigmas = spectrum.sigmas[known]
-    links = slice(3, 3 + len(state.compliance))
+    links = np.diag(shared)[size + 3 :]
     return Refinement(
         estimate=ChainEstimate(
             chain=state.chain,
@@ -466,9 +379,9 @@ def _report(
         residuals=frozen(np.stack(by_motion)),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
         calibration_prior=problem.calibration,
-        calibration=_posterior(problem, state, nuisance),
+        calibration=_posterior(problem, state, normal.own_covariance(shared)),
         compliance=frozen(state.compliance),
-        compliance_sigma=frozen(scale * np.sqrt(np.diag(nuisance)[links])),
+        compliance_sigma=frozen(scale * np.sqrt(links)),
         encoder_scale=frozen(np.zeros(len(state.own))),
         encoder_scale_sigma=frozen(np.zeros(len(state.own))),
     )

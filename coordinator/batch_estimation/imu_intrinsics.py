@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from module_agent.model.chain import Array
 from module_agent.model.imu_prior import ImuPrior
 
+Index = NDArray[np.int64]
+
 # One IMU's errors as one vector: E of the gyro and of the accelerometer row by row, their biases, the delay,
 # and the gyro's sensitivity to specific force row by row.
 SIZE = 34
@@ -95,13 +97,24 @@ def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool
 
     gyro, accel: (m, 3) true values. rates: (m, 6) or None. free: (34,).
     """
-    samples = len(gyro)
-    derivatives = np.zeros((SIZE, 6, samples))
-    for row in range(3):
-        derivatives[3 * row : 3 * row + 3, row] = gyro.T
-        derivatives[9 + 3 * row : 12 + 3 * row, 3 + row] = accel.T
-        derivatives[25 + 3 * row : 28 + 3 * row, row] = accel.T
-    derivatives[18:24] = np.eye(6)[:, :, None]
-    if rates is not None:
-        derivatives[DELAY] = -rates.T
+    derivatives = np.zeros((SIZE, 6, len(gyro)))
+    for axis in range(6):
+        errors, by_error = axis_slopes(gyro, accel, rates, axis)
+        derivatives[errors, axis] = by_error
     return derivatives[free]
+
+
+def axis_slopes(gyro: Array, accel: Array, rates: Array | None, axis: int) -> tuple[Index, Array]:
+    """Return on which errors one axis of an IMU depends, and the derivatives of its readings by them (k, m).
+
+    gyro, accel: (m, 3) true values. rates: (m, 6) of the readings, or None without delays. axis: 0 to 2 of
+    the gyro, 3 to 5 of the accelerometer.
+    """
+    matrix, bias, by_axis = 3 * axis + np.arange(3), GYRO_BIAS.start + axis, (gyro if axis < 3 else accel).T
+    parts = [(matrix, by_axis), ([bias], np.ones((1, len(gyro))))]
+    if rates is not None:
+        parts.append(([DELAY], -rates[:, axis][None]))
+    if axis < 3:
+        parts.append((_FORCE.start + matrix, accel.T))
+    errors, derivatives = zip(*parts, strict=True)
+    return np.concatenate(errors), np.concatenate(derivatives)

@@ -3,17 +3,22 @@
 A perturbation xi of module a makes the turn exp(S q) of its joint into exp(xi) exp(S q) exp(-xi). So all that
 lies beyond the joint is displaced by xi in the frame of the body below, and by -xi in that of the body
 beyond; the module's own IMU is displaced by xi in the frame of its carrier. All that is needed is the change
-of one IMU's readings when it is displaced, together with everything between, by a constant twist in the
-frame of some body that carries it.
+of one IMU's readings when it is displaced, together with everything between, by a twist in the frame of some
+body that carries it: a constant one, or, of links and joints that turn more than they should, one that
+changes with time.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from coordinator.batch_estimation.imu_prediction import BodyMotion, acceleration_at, turned
+from coordinator.batch_estimation.imu_kernel import LANES, Path, fill_slopes
+from coordinator.batch_estimation.imu_prediction import BodyMotion
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import cross, skew
+
+Index = NDArray[np.int64]
 
 
 class ImuJacobian(NamedTuple):
@@ -30,16 +35,114 @@ class ImuJacobian(NamedTuple):
     placement: Array
 
 
-class _Seen(NamedTuple):
-    """An IMU relative to a body, in the body's frame: frame (3, 3, m), place and velocity (3, m)."""
+class Displacements(NamedTuple):
+    """Small displacements that change with time, each of everything beyond a link or a joint.
 
-    frame: Array
-    place: Array
-    velocity: Array
+    modules: (p,) the modules of these links and joints. of_joint: (p,) whether it is the joint: the housing
+    that a link carries moves with the link, and only with the joint if it is mounted reversed. twists:
+    (p, 18, m) turn [rad] and shift [m] in the frame of the body below, their first and their second time
+    derivatives.
+    """
+
+    modules: tuple[int, ...]
+    of_joint: tuple[bool, ...]
+    twists: Array
+
+    def joined(self, other: "Displacements") -> "Displacements":
+        """Return these and then the others."""
+        twists = np.concatenate([self.twists, other.twists])
+        return Displacements(self.modules + other.modules, self.of_joint + other.of_joint, twists)
+
+
+class SeenDisplacements(NamedTuple):
+    """Those displacements that one IMU sees: their numbers, from the root on, and `fill_slopes`'s `first`."""
+
+    numbers: Index
+    first: Index
+
+
+class Motion(NamedTuple):
+    """The motion of a chain as the kernels take it: m' samples, a multiple of theirs, the last one repeated.
+
+    bodies: (n + 1, 9, m'). signals: (3, n, m') sine and cosine of the joints' positions, and their rates.
+    """
+
+    bodies: Array
+    signals: Array
+
+
+def kernel_motion(bodies: Sequence[BodyMotion], q_rad: Array, qd_rad_s: Array) -> Motion:
+    """Return bodies (`body_motions`) and joints (m, n) as the kernels take them."""
+    signals = np.stack([np.sin(q_rad.T), np.cos(q_rad.T), qd_rad_s.T])
+    return Motion(padded(np.stack([np.concatenate(body) for body in bodies])), padded(signals))
+
+
+def padded(signals: Array) -> Array:
+    """Return signals (..., m) as the kernels take them, the last sample repeated to a multiple of theirs."""
+    samples = signals.shape[-1]
+    missing = -samples % LANES
+    return np.concatenate([signals, np.repeat(signals[..., -1:], missing, axis=-1)], axis=-1)
+
+
+def imu_path(chain: Chain, module: int) -> Path:
+    """Return what one module's IMU depends on."""
+    path = np.array(chain.ancestors(module), dtype=np.int64)
+    # Copies: kernels are compiled anew for arrays that cannot be written to.
+    axis, point, home = (np.array(a) for a in (chain.axis, chain.point, chain.imu_home[module]))
+    return Path(path, chain.reversed[module], axis, point, home)
+
+
+def seen_by(path: Path, some: Displacements) -> SeenDisplacements:
+    """Return which displacements one IMU sees."""
+    own = path.modules[-1]
+    each = [
+        [
+            p
+            for p, (other, joint) in enumerate(zip(some.modules, some.of_joint, strict=True))
+            if other == module and (path.turned or not joint or module != own)
+        ]
+        for module in path.modules.tolist()
+    ]
+    first = np.cumsum([0, *map(len, each)]).astype(np.int64)
+    return SeenDisplacements(np.array([p for part in each for p in part], dtype=np.int64), first)
+
+
+def weighted_slopes(
+    path: Path,
+    motion: Motion,
+    twists: Array,
+    seen: SeenDisplacements,
+    mixing: Array,
+    weight: Array,
+    residual: Array,
+) -> tuple[Array, Array]:
+    """Return the slopes of one IMU's weighted readings, zero beyond the samples.
+
+    Args:
+        path: of k modules to the IMU.
+        motion: of the chain, m' places for m samples.
+        twists: (l, 18, m') displacements, p of which the IMU has `seen`.
+        mixing: (6, 6) from true rates and forces to readings.
+        weight: (2, m) of gyro and accelerometer.
+        residual: (6, m) of the readings.
+
+    Returns:
+        (6 k + 3 + p + 1, 6, m') by the modules' twists, gravity and displacements, and in the last row the
+        weighted residual; (6, 6, m') by the placement.
+    """
+    samples, places = weight.shape[1], motion.bodies.shape[2]
+    weights = np.zeros((2, places))
+    weights[:, :samples] = weight
+    shared = np.empty((6 * len(path.modules) + 3 + len(seen.numbers) + 1, 6, places))
+    shared[-1, :, samples:] = 0.0
+    shared[-1, :, :samples] = residual * np.repeat(weight, 3, axis=0)
+    placed = np.empty((6, 6, places))
+    fill_slopes(path, *motion, twists, *seen, np.array(mixing), weights, True, shared, placed)
+    return shared, placed
 
 
 def imu_jacobian(
-    chain: Chain, bodies: list[BodyMotion], q_rad: Array, qd_rad_s: Array, module: int
+    chain: Chain, bodies: Sequence[BodyMotion], q_rad: Array, qd_rad_s: Array, module: int
 ) -> ImuJacobian:
     """Differentiate the readings of one module's IMU.
 
@@ -49,62 +152,35 @@ def imu_jacobian(
         q_rad, qd_rad_s: (m, n) joint positions and velocities.
         module: the module that the IMU belongs to.
     """
-    body = chain.carrier(module)
-    joints = chain.ancestors(body)
-    samples, home = q_rad.shape[0], chain.imu_home[module]
-    frame = np.broadcast_to(home[:3, :3, None], (3, 3, samples))
-    seen = _Seen(frame, np.broadcast_to(home[:3, 3, None], (3, samples)), np.zeros((3, samples)))
-    moved = {body: _displaced(bodies[body], seen)}
-    for joint in reversed(joints):
-        seen = _from_below(chain, joint, q_rad[:, joint], qd_rad_s[:, joint], seen)
-        moved[chain.parent[joint]] = _displaced(bodies[chain.parent[joint]], seen)
-    poses = {joint: moved[chain.parent[joint]] - moved[joint] for joint in joints}
-    poses[module] = poses.get(module, 0.0) + moved[body]
-    modules = tuple(sorted(poses))
-    gravity = np.zeros((3, 6, samples))
-    gravity[:, 3:] = seen.frame
-    turn, place = chain.imu_home[module, :3, :3], chain.imu_home[module, :3, 3]
-    # A turn about the IMU itself is one about the frame's origin, and a displacement back.
-    about_itself = np.block([[turn.T, -turn.T @ skew(place)], [np.zeros((3, 3)), turn.T]])
-    placement = np.einsum("ij,jcm->icm", about_itself, moved[body])
-    return ImuJacobian(modules, np.concatenate([poses[joint] for joint in modules]), gravity, placement)
+    path, motion = imu_path(chain, module), kernel_motion(bodies, q_rad, qd_rad_s)
+    samples, size = len(q_rad), 6 * len(path.modules)
+    none = Displacements((), (), np.empty((0, 18, motion.bodies.shape[2])))
+    ones, zeros = np.ones((2, samples)), np.zeros((6, samples))
+    shared, placed = weighted_slopes(path, motion, none.twists, seen_by(path, none), np.eye(6), ones, zeros)
+    shared, placed = shared[..., :samples], placed[..., :samples]
+    return ImuJacobian(tuple(path.modules.tolist()), shared[:size], shared[size:-1], placed)
 
 
-def _from_below(chain: Chain, joint: int, q: Array, qd: Array, seen: _Seen) -> _Seen:
-    """Return the IMU relative to the body below a joint, from that relative to the body beyond."""
-    axis, point = chain.axis[joint], chain.point[joint][:, None]
-    stacked = np.concatenate([seen.frame, (seen.place - point)[:, None], seen.velocity[:, None]], axis=1)
-    moved = turned(axis, q, stacked)
-    off = moved[:, 3]
-    return _Seen(moved[:, :3], point + off, moved[:, 4] + cross(axis[:, None] * qd, off))
+def displaced_readings(chain: Chain, motion: Motion, some: Displacements, amounts: Array) -> Array:
+    """Return by how much displacements, (p,) times their units, change all IMUs' readings, (n, 6, m').
 
-
-def _displaced(body: BodyMotion, seen: _Seen) -> Array:
-    """Return the slopes (6, 6, m) of the IMU's readings by a twist [theta, tau] in a body's frame.
-
-    With the IMU at x, moving at x' and accelerating at x'' in that frame, its readings are
-    R^T (omega + relative rate) and R^T (a + x'' + 2 omega x x' + M x), M = [alpha x] + [omega x]^2. The twist
-    turns R, x, x' and x'' by theta and moves x by tau; what is turned with R cancels.
+    motion, some: in m' places.
     """
-    spin, place, velocity = (_matrix(v) for v in (body.omega, seen.place, seen.velocity))
-    carried = _matrix(body.alpha) + _product(spin, spin)
-    force = acceleration_at(body, seen.place) + 2.0 * cross(body.omega, seen.velocity)
-    turning = _matrix(force) - 2.0 * _product(spin, velocity) - _product(carried, place)
-    changes = np.concatenate([spin, turning, carried], axis=1)
-    rate, by_turning, by_moving = np.split(np.einsum("jim,jcm->cim", seen.frame, changes), 3)
-    slopes = np.zeros((6, 6, seen.place.shape[1]))
-    slopes[:3, :3], slopes[:3, 3:], slopes[3:, 3:] = rate, by_turning, by_moving
-    return slopes
-
-
-def _matrix(vectors: Array) -> Array:
-    """Return the matrices (3, 3, m) of the cross products with vectors (3, m)."""
-    x, y, z = vectors
-    matrices = np.zeros((3, *vectors.shape))
-    matrices[0, 1], matrices[0, 2], matrices[1, 2] = -z, y, -x
-    matrices[1, 0], matrices[2, 0], matrices[2, 1] = z, -y, x
-    return matrices
-
-
-def _product(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("ijm,jcm->icm", a, b))
+    change = np.zeros((len(chain.serials), 6, motion.bodies.shape[2]))
+    if not some.modules:
+        return change
+    kinds = list(zip(some.modules, some.of_joint, strict=True))
+    different = sorted(set(kinds))
+    sums = np.zeros((len(different), *some.twists.shape[1:]))
+    for kind, amount, twist in zip(kinds, amounts, some.twists, strict=True):
+        sums[different.index(kind)] += amount * twist
+    modules, of_joint = (tuple(column) for column in zip(*different, strict=True))
+    together = Displacements(modules, of_joint, sums)
+    ones, none = np.ones((2, change.shape[2])), np.empty((0, 6, change.shape[2]))
+    for k in range(len(chain.serials)):
+        path = imu_path(chain, k)
+        seen = seen_by(path, together)
+        slopes = np.empty((len(seen.numbers), *change.shape[1:]))
+        fill_slopes(path, *motion, sums, *seen, np.eye(6), ones, False, slopes, none)
+        change[k] = slopes.sum(axis=0)
+    return change

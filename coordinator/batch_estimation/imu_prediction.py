@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from coordinator.batch_estimation.imu_kernel import fill_bodies
 from coordinator.batch_estimation.sensor_data import BaseMotion
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import cross, skew
@@ -83,9 +84,20 @@ def body_motions(
     q, qd, qdd = (np.asarray(signal, dtype=float).T for signal in (q_rad, qd_rad_s, qdd_rad_s2))
     base = _base(chain, q.shape[1], base_motion)
     bodies: list[BodyMotion] = []
+    if turns is None:
+        motion = np.empty((len(chain.parent) + 1, 9, q.shape[1]))
+        motion[-1] = np.concatenate(base)
+        fill_bodies(
+            np.array(chain.parent, dtype=np.int64),
+            np.array(chain.axis),
+            np.array(chain.point),
+            np.stack([q.T, qd.T, qdd.T]),
+            motion,
+        )
+        return [BodyMotion(body[:3], body[3:6], body[6:]) for body in motion]
     for i, parent in enumerate(chain.parent):
         below = base if parent == BASE else bodies[parent]
-        below = below if turns is None else given(below, turns.get(i, ()))
+        below = given(below, turns.get(i, ()))
         bodies.append(_carry(below, chain.axis[i], chain.point[i][:, None], q[i], qd[i], qdd[i]))
     return [*bodies, base]
 

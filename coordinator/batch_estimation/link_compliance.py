@@ -13,15 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from coordinator.batch_estimation.imu_jacobian import Displacements
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
-    ImuReadings,
     LinkTurn,
     LinkTurns,
     acceleration_at,
     body_motions,
     given,
-    readings_on,
     turned,
 )
 from coordinator.batch_estimation.sensor_data import SensorData
@@ -39,8 +38,6 @@ HINGE_SIGMAS = (HINGE_SHARE_SIGMA, HINGE_ASIDE_SIGMA_M, HINGE_ASIDE_SIGMA_M)
 # A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: only
 # the product of load and compliance is observable.
 LINK_MASS_KG, LINK_MASS_KG_M = 0.2, 0.4
-
-JointTrack = tuple[Array, Array, Array]  # positions, velocities, accelerations, (m, n) each
 
 
 class LinkLoad(NamedTuple):
@@ -164,17 +161,21 @@ def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
 
 
 class ComplianceJacobian(NamedTuple):
-    """How IMU readings change with the links' compliances.
+    """How the links move, and with them the readings of IMUs, with the links' compliances.
 
-    links: (p,) the module that each compliance's link carries. sigmas: (p,) how well each is known before,
-    in `UNIT_RAD_NM`, or for hinges in shares of the length and in metres. slopes: (p, 6, m, n) of [gyro,
-    specific force]. taken: (p,) the part that the loads contain already, which the prior is about, too.
+    sigmas: (p,) how well each compliance is known before, in `UNIT_RAD_NM`, or for hinges in shares of the
+    length and in metres. carried: p displacements, by one unit each. taken: (p,) the part that the loads
+    contain already, which the prior is about, too.
     """
 
-    links: tuple[int, ...]
     sigmas: Array
-    slopes: Array
+    carried: Displacements
     taken: Array
+
+    @property
+    def links(self) -> tuple[int, ...]:
+        """The module that each compliance's link carries, (p,)."""
+        return self.carried.modules
 
 
 # One unit of compliance; that of a metre of light aluminium tube.
@@ -184,67 +185,57 @@ UNIT_RAD_NM = 1e-4
 COMPLIANCE_SIGMA = 30.0
 
 
-def compliance_jacobian(
-    chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None]
+def compliance_jacobian(loads: Sequence[LinkLoad | None], samples: int) -> ComplianceJacobian:
+    """Return how every link's compliance in bending and in twisting moves what it carries, m samples."""
+    links = [(module, load) for module, load in enumerate(loads) if load is not None]
+    twists = [_twist(turn) for _, load in links for turn in load.turns(UNIT_RAD_NM, UNIT_RAD_NM)]
+    modules = tuple(module for module, _ in links for _ in range(2))
+    return _by_links(modules, np.full(len(modules), COMPLIANCE_SIGMA), twists, samples)
+
+
+def _under(load: LinkLoad, pair: Array) -> Array:
+    """Return the displacement (18, m) by a load, for compliances in bending and in twisting."""
+    bending, twisting = load.turns(*pair)
+    return _twist(bending) + _twist(twisting)
+
+
+def _twist(turn: LinkTurn) -> Array:
+    """Return the displacement (18, m) by a turn about a hinge: a turn about the origin, and a shift."""
+    shift = cross(np.broadcast_to(turn.hinge[:, None], turn.theta_rad.shape), turn.theta_rad)
+    return np.concatenate([turn.theta_rad, shift], axis=1).reshape(18, -1)
+
+
+def _by_links(
+    modules: tuple[int, ...], sigmas: Array, twists: Sequence[Array], samples: int
 ) -> ComplianceJacobian:
-    """Return the slopes of all IMUs' readings by every link's compliance in bending and in twisting."""
-    still = readings_on(chain, body_motions(chain, *joints))
-    links: list[int] = []
-    slopes: list[Array] = []
-    for module, load in enumerate(loads):
-        if load is None:
-            continue
-        for turn in load.turns(UNIT_RAD_NM, UNIT_RAD_NM):
-            links.append(module)
-            slopes.append(_change(chain, joints, still, module, turn))
-    if not links:
-        return rigid(len(chain.serials), len(joints[0]))
-    count = len(links)
-    return ComplianceJacobian(
-        tuple(links), np.full(count, COMPLIANCE_SIGMA), np.array(slopes), np.zeros(count)
-    )
-
-
-def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, *turn: LinkTurn) -> Array:
-    """Return the change of all IMUs' readings by turns of one link, (6, m, n)."""
-    turns = {module: turn}
-    moved = readings_on(chain, body_motions(chain, *joints, turns=turns), turns)
-    change = [moved.gyro_rad_s - still.gyro_rad_s, moved.accel_m_s2 - still.accel_m_s2]
-    return np.concatenate(change, axis=2).transpose(2, 0, 1)
+    carried = Displacements(modules, (False,) * len(modules), np.array(twists).reshape(-1, 18, samples))
+    return ComplianceJacobian(sigmas, carried, np.zeros(len(modules)))
 
 
 def hinge_slopes(
-    chain: Chain,
-    joints: JointTrack,
-    loads: Sequence[LinkLoad | None],
-    compliance: Array,
-    taken: Array | None = None,
+    loads: Sequence[LinkLoad | None], samples: int, compliance: Array, taken: Array | None = None
 ) -> ComplianceJacobian:
-    """Return the slopes of `compliance_jacobian` and those by the places of the hinges (`LinkLoad.shifts`).
+    """Return `compliance_jacobian` and the displacements by the places of the hinges (`LinkLoad.shifts`).
 
     Their size follows from the compliances (2 l,) of l links, as estimated with the former alone. taken:
     (3 l,) by how much the hinges of the loads have been moved already.
     """
-    known = compliance_jacobian(chain, joints, loads)
-    if not known.links:
-        return known
+    known = compliance_jacobian(loads, samples)
     links: list[int] = []
-    slopes: list[Array] = []
-    still = readings_on(chain, body_motions(chain, *joints))
+    twists: list[Array] = []
     for place, module in enumerate(known.links[::2]):
         load = loads[module]
         assert load is not None
-        bending, twisting = UNIT_RAD_NM * compliance[2 * place : 2 * place + 2]
-        here = _change(chain, joints, still, module, *load.turns(bending, twisting))
+        pair = UNIT_RAD_NM * compliance[2 * place : 2 * place + 2]
+        here = _under(load, pair)
         for shift in load.shifts:
             # Linear in the shift: a centimetre is small, and far from what numbers resolve.
-            there = load.moved(0.01 * shift).turns(bending, twisting)
-            slopes.append(100.0 * (_change(chain, joints, still, module, *there) - here))
+            twists.append(100.0 * (_under(load.moved(0.01 * shift), pair) - here))
             links.append(module)
+    hinges = _by_links(tuple(links), np.tile(HINGE_SIGMAS, len(links) // 3), twists, samples)
     return ComplianceJacobian(
-        (*known.links, *links),
-        np.concatenate([known.sigmas, np.tile(HINGE_SIGMAS, len(links) // 3)]),
-        np.concatenate([known.slopes, np.array(slopes)]),
+        np.concatenate([known.sigmas, hinges.sigmas]),
+        known.carried.joined(hinges.carried),
         np.concatenate([known.taken, np.zeros(len(links)) if taken is None else taken]),
     )
 
@@ -272,9 +263,9 @@ def turns_under(
     return turns
 
 
-def rigid(count: int, samples: int) -> ComplianceJacobian:
+def rigid(samples: int) -> ComplianceJacobian:
     """Return the empty Jacobian of rigid links."""
-    return ComplianceJacobian((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
+    return _by_links((), np.zeros(0), [], samples)
 
 
 def loads_of(

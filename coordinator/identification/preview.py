@@ -188,7 +188,7 @@ class Previewer:
         data = thinned(parts, FITTED_EVERY)
         rigid = refine_chain(chain, data, prior)
         loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / RETAINED_EVERY), FITTED_EVERY)
-        refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(rigid.chain, data.joints, loads))
+        refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(loads, len(data.q_rad)))
         off = refined.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]
         # Of numbers that are not finite, too.
         diverged = not np.linalg.norm(off, axis=1).max() < MAX_SHIFT_M

@@ -156,12 +156,12 @@ def refine_robot(
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep, known)
     if not giving.compliance.size:
         fine = thinned(parts, keep)
-        flex = without_links(count, len(fine.q_rad))
+        flex = without_links(len(fine.q_rad))
         rigid_links = _with_encoders(giving.chain, fine, prior, flex, known, suspects, noise)
         return rigid_links._replace(late_s=late_s)
     # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
-    flex = hinge_slopes(giving.chain, coarse.smooth, joined(loads, COARSE * keep), giving.compliance)
+    flex = hinge_slopes(joined(loads, COARSE * keep), len(coarse.q_rad), giving.compliance)
     tested = Suspects((), tuple(range(count)), suspects.scale)
     hinged = _with_encoders(giving.chain, coarse, prior, flex, known, tested)
     links = len(giving.compliance)
@@ -172,7 +172,7 @@ def refine_robot(
     loads = with_hinges_moved(loads, joints, moved)
     fine = thinned(parts, keep)
     compliance = hinged.compliance[:links]
-    flex = hinge_slopes(hinged.chain, fine.smooth, joined(loads, keep), compliance, moved)
+    flex = hinge_slopes(joined(loads, keep), len(fine.q_rad), compliance, moved)
     refined = _with_encoders(hinged.chain, fine, prior, flex, known, suspects, noise)
     if not suspects.encoders:
         refined = refined._replace(
@@ -219,7 +219,7 @@ def _giving(
     """
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
-    flex = compliance_jacobian(rigid.chain, resting.smooth, loads)
+    flex = compliance_jacobian(loads, len(resting.q_rad))
     at_rest = refine_chain(rigid.chain, resting, prior, flex, calibration)
     data = thinned(parts, keep)
     single_module = len(rigid.chain.serials) == 1

@@ -29,8 +29,11 @@ GROUPS = {
         "module_agent.firmware.tick_kernel",
     ),
     "regressor": ("module_agent.model.regressor_kernel",),
+    "IMUs' readings": ("coordinator.batch_estimation.imu_kernel",),
 }
 ROBOT = "thesis_171_horizontal"
+# Samples that are enough to fit a chain to.
+REST = 8
 
 
 def compile_kernels() -> None:
@@ -48,10 +51,8 @@ def compile_kernels() -> None:
 
 def call_kernels(group: str) -> None:
     """Call every kernel of a group with arguments of the types that a run has."""
-    if group == "world":
-        _call_world()
-    else:
-        _call_regressor()
+    calls = {"world": _call_world, "regressor": _call_regressor, "IMUs' readings": _call_estimator}
+    calls[group]()
 
 
 def _call_world() -> None:
@@ -82,6 +83,18 @@ def _call_regressor() -> None:
     chain, still = true_chain(robot), np.zeros((1, len(robot.modules)))
     torque_regressor(chain, still, still, still)
     inverse_dynamics(chain, np.ones(10 * len(robot.modules)), still, still, still)
+
+
+def _call_estimator() -> None:
+    from coordinator.batch_estimation.estimator import refine_chain
+    from coordinator.batch_estimation.imu_prediction import imu_readings
+    from coordinator.batch_estimation.sensor_data import SensorData
+    from sim.robot.robot_file import load_robot
+    from sim.robot.robot_tree import true_chain
+
+    robot = load_robot(ROBOT)
+    chain, at_rest = true_chain(robot), np.zeros((REST, len(robot.modules)))
+    refine_chain(chain, SensorData(*(at_rest,) * 3, *imu_readings(chain, *(at_rest,) * 3)))
 
 
 if __name__ == "__main__":

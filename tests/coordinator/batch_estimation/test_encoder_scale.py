@@ -12,6 +12,7 @@ from coordinator.batch_estimation.link_compliance import rigid
 from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import CALIBRATED
+from tests.random_chains import displaced
 
 GYRO_NOISE, ACCEL_NOISE = 2e-4, 3e-3
 
@@ -40,23 +41,24 @@ def _moved_more(joints: tuple[Array, Array, Array], module: int, scale: float) -
 @pytest.mark.parametrize("module", [0, 2])
 def test_slopes_are_those_of_a_motion_that_is_larger(robots: Any, module: int) -> None:
     chain, joints = _chain(robots, 3), _swing(4)
-    flex = with_encoder_scales(rigid(4, len(joints[0])), chain, joints, [module])
+    flex = with_encoder_scales(rigid(len(joints[0])), chain, joints, [module])
     assert flex.links == (module,)
     assert flex.sigmas.tolist() == [ENCODER_SCALE_SIGMA]
     assert flex.taken.tolist() == [0.0]
     # Central differences over a step of a thousandth leave a millionth of the second derivative's share.
     more, less = (imu_readings(chain, *_moved_more(joints, module, scale)) for scale in (1e-3, -1e-3))
-    for part, (up, down) in zip(np.split(flex.slopes[0], 2), zip(more, less, strict=True), strict=True):
-        slope = (up - down).transpose(2, 0, 1) / 2e-3
+    slopes = displaced(chain, joints, flex.carried, np.ones(1))
+    for part, (up, down) in zip(np.split(slopes, 2, axis=1), zip(more, less, strict=True), strict=True):
+        slope = (up - down).transpose(1, 2, 0) / 2e-3
         np.testing.assert_allclose(part, slope, atol=2e-3 * float(np.abs(slope).max()))
     # IMUs that the joint does not carry read the same.
     carried = [module in chain.ancestors(chain.carrier(k)) for k in range(4)]
-    assert flex.slopes[0].any(axis=(0, 1)).tolist() == carried
+    assert slopes.any(axis=(1, 2)).tolist() == carried
 
 
 def test_without_modules_nothing_is_added(robots: Any) -> None:
     joints = _swing(4)
-    flex = rigid(4, len(joints[0]))
+    flex = rigid(len(joints[0]))
     assert with_encoder_scales(flex, _chain(robots, 3), joints, []) is flex
 
 
@@ -70,7 +72,7 @@ def test_the_scale_of_an_encoder_is_recovered_and_lengths_with_it(robots: Any, s
         for signal, size in zip(true, (GYRO_NOISE, ACCEL_NOISE), strict=True)
     )
     data = SensorData(*joints, gyro, accel, np.zeros((*gyro.shape[:2], 6)))
-    flex = with_encoder_scales(rigid(4, len(joints[0])), chain, joints, range(4))
+    flex = with_encoder_scales(rigid(len(joints[0])), chain, joints, range(4))
     free, trusting = (refine_chain(chain, data, CALIBRATED, each) for each in (flex, None))
     scale, sigma = free.compliance, free.compliance_sigma
     assert abs(scale[1] - 0.01) < 4.0 * sigma[1] < 0.002

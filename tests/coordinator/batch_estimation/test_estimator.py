@@ -19,6 +19,7 @@ from coordinator.batch_estimation.imu_intrinsics import (
     read,
     slopes,
 )
+from coordinator.batch_estimation.imu_jacobian import Displacements
 from coordinator.batch_estimation.imu_prediction import imu_readings
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian
 from coordinator.batch_estimation.sensor_data import SensorData
@@ -28,6 +29,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import BIASES_ONLY, CALIBRATED, UNCALIBRATED, ImuPrior
 from module_agent.model.perturbation import apply_perturbation
+from tests.random_chains import displaced
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03
 
@@ -417,14 +419,14 @@ def test_links_that_contradict_their_prior_widen_the_claim_where_residuals_are_s
     truth, _ = robots.random(4, joints=3, serial=True)
     data = _sensed(truth, 1, noise=1.0)
     samples = len(data.q_rad)
-    # One compliance shows as a slow wave in the last gyro, as large as five sigmas of its prior.
-    seen = 20.0 * GYRO_NOISE * np.sin(np.arange(samples) / 40.0)
-    slopes = np.zeros((1, 6, samples, 3))
-    slopes[0, 0, :, 2] = seen
-    flex = ComplianceJacobian((2,), np.array([1.0]), slopes, np.zeros(1))
-    gyro, accel = data.gyro_rad_s.copy(), data.accel_m_s2.copy()
-    gyro[:, 2, 0] += 5.0 * seen
-    data = data._replace(gyro_rad_s=gyro)
+    # One compliance shows as a slow turning of the last link, as large as five sigmas of its prior.
+    twists = np.zeros((1, 18, samples))
+    twists[0, 6] = 20.0 * GYRO_NOISE * np.sin(np.arange(samples) / 40.0)
+    flex = ComplianceJacobian(np.array([1.0]), Displacements((2,), (False,), twists), np.zeros(1))
+    seen = displaced(truth, data.joints, flex.carried, np.array([5.0])).transpose(2, 0, 1)
+    data = data._replace(gyro_rad_s=data.gyro_rad_s + seen[..., :3])
+    accel = data.accel_m_s2 + seen[..., 3:]
+    data = data._replace(accel_m_s2=accel.copy())
     noise = np.array([GYRO_NOISE, ACCEL_NOISE])[:, None, None] * np.ones((2, 1, 3))
     modelled = refine_chain(truth, data, flex=flex, noise=noise)
     unaware = refine_chain(truth, data, flex=flex)

@@ -28,6 +28,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics
+from tests.random_chains import displaced
 
 RATE_HZ = 250.0
 
@@ -135,7 +136,7 @@ def test_links_that_bend_come_out_as_long_as_they_are(robots: Any, seed: int) ->
     chain, types = _forward(robots, 20 + seed, 4)
     data, loads = _bent(chain, types, 4.0, seed)
     stiff = refine_chain(chain, data)
-    flex = compliance_jacobian(chain, data.joints, loads)
+    flex = compliance_jacobian(loads, len(data.q_rad))
     found = refine_chain(chain, data, flex=flex)
     apart = [np.abs(one.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]).max() for one in (stiff, found)]
     assert apart[1] < 0.2 * apart[0]
@@ -150,8 +151,8 @@ def test_where_a_link_bends_is_a_share_of_its_length(robots: Any) -> None:
     """Readings of links that bend at their clamps differ from the model's by the hinges' slopes."""
     chain, types = _forward(robots, 21, 3)
     data, loads = _bent(chain, types, 4.0, 0)
-    flex = compliance_jacobian(chain, data.joints, loads)
-    known = hinge_slopes(chain, data.joints, loads, np.full(len(flex.links), 4.0))
+    flex = compliance_jacobian(loads, len(data.q_rad))
+    known = hinge_slopes(loads, len(data.q_rad), np.full(len(flex.links), 4.0))
     assert known.links[len(flex.links) :] == (1, 1, 1, 2, 2, 2)
     still = readings_on(chain, body_motions(chain, *data.joints))
     load = loads[1]
@@ -161,13 +162,14 @@ def test_where_a_link_bends_is_a_share_of_its_length(robots: Any) -> None:
     there = load.moved(share * load.shifts[0] + aside_m * load.shifts[1])
     turns = {1: there.turns(4.0 * UNIT_RAD_NM, 4.0 * UNIT_RAD_NM)}
     moved = readings_on(chain, body_motions(chain, *data.joints, turns=turns), turns)
-    by_place = known.slopes[len(flex.links) :]
-    by_slopes = 4.0 * (flex.slopes[0] + flex.slopes[1]) + share * by_place[0] + aside_m * by_place[1]
+    amounts = np.zeros(len(known.links))
+    amounts[:2], amounts[len(flex.links) : len(flex.links) + 2] = 4.0, (share, aside_m)
+    by_slopes = displaced(chain, data.joints, known.carried, amounts)[:, 3:]
     np.testing.assert_allclose(
         # What goes with the squares of turn and shift is left out: some hundredths of the shifts' share.
-        (moved.accel_m_s2 - still.accel_m_s2).transpose(2, 0, 1),
-        by_slopes[3:],
-        atol=1e-2 * float(np.abs(by_slopes[3:]).max()),
+        (moved.accel_m_s2 - still.accel_m_s2).transpose(1, 2, 0),
+        by_slopes,
+        atol=1e-2 * float(np.abs(by_slopes).max()),
     )
 
 
@@ -188,9 +190,9 @@ def test_a_robot_without_links_has_nothing_that_bends(robots: Any) -> None:
     joints = _swing(1, 1.0)
     loads = link_loads(chain, types, body_motions(chain, *joints), joints[0], RATE_HZ)
     assert loads == [None]
-    found = compliance_jacobian(chain, joints, loads)
-    assert found.links == rigid(1, len(joints[0])).links
-    assert found.slopes.shape == (0, 6, len(joints[0]), 1)
+    found = compliance_jacobian(loads, len(joints[0]))
+    assert found.links == rigid(len(joints[0])).links == ()
+    assert found.carried.twists.shape == (0, 18, len(joints[0]))
 
 
 def test_noise_of_encoders_makes_no_link_shorter_where_the_instrument_is_free_of_it(robots: Any) -> None:
