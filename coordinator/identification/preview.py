@@ -148,6 +148,9 @@ def _linked(forest: Topology) -> Topology:
 # 50 samples per second of every motion are retained, for the loads of its links; the refinement uses a
 # quarter of them: six per period of the windowed sine.
 RETAINED_EVERY, FITTED_EVERY = 5, 4
+# IMU samples that a preview is fitted to at most: those of all motions of seven modules. Without a bound the
+# samples would grow with the square of the modules, and the time with their fourth power.
+MAX_IMU_SAMPLES = 5_000
 # A refinement that moves a module farther than this from its assembled position has diverged.
 MAX_SHIFT_M = 0.15
 
@@ -155,8 +158,9 @@ MAX_SHIFT_M = 0.15
 class Previewer:
     """Computes previews of one robot from its growing recording, one at a time.
 
-    Robots of more than `max_refined` modules are only assembled: a refinement of seven modules costs half a
-    second, and the cost grows with the square of their number.
+    The work of a preview is bounded by what it counts, samples and iterations, not by a clock: the same
+    recording gives the same preview. Robots of more than `max_refined` modules are only assembled: the
+    refinement's cost grows with the square of their number.
     """
 
     def __init__(self, recording: Recording, max_refined: float | None = None):
@@ -185,9 +189,10 @@ class Previewer:
         chain, prior = assembled.fit.chain, IMU_PRIORS[self._recording.imu]
         kinds = [self._recording.module_type(s) for s in chain.serials]
         parts = self._parts_of(chain.serials)
-        data = thinned(parts, FITTED_EVERY)
+        every = max(FITTED_EVERY, -(-sum(part.q_rad.size for part in parts) // MAX_IMU_SAMPLES))
+        data = thinned(parts, every)
         rigid = refine_chain(chain, data, prior)
-        loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / RETAINED_EVERY), FITTED_EVERY)
+        loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / RETAINED_EVERY), every)
         refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(loads, len(data.q_rad)))
         off = refined.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]
         # Of numbers that are not finite, too.

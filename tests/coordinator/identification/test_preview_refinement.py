@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.estimator import Refinement, refine_chain
+from coordinator.batch_estimation.sensor_data import SensorData
+from coordinator.identification import preview as module
 from coordinator.identification.preview import Preview, Previewer, preview
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
+from module_agent.model.chain import Chain
 
 BASE, TIP = "X-00009", "X-00010"
 TRUE_M = 0.35
@@ -96,3 +100,24 @@ def test_a_repeated_preview_is_identical(recording: Recording) -> None:
 
 def test_before_any_motion_there_is_no_preview(recording: Recording) -> None:
     assert Previewer(until(recording, [])).preview([]) is None
+
+
+def test_the_samples_of_a_preview_are_bounded(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[int] = []
+
+    def counted(chain: Chain, data: SensorData, *others: Any) -> Refinement:
+        fitted.append(data.q_rad.size)
+        return refine_chain(chain, data, *others)
+
+    monkeypatch.setattr(module, "refine_chain", counted)
+    whole = Previewer(recording).preview([BASE, TIP])
+    monkeypatch.setattr(module, "MAX_IMU_SAMPLES", 80)
+    bounded = Previewer(recording).preview([BASE, TIP])
+    # Of every motion the first sample counts, and the last part may be short.
+    assert len(fitted) == 4
+    assert max(fitted[2:]) <= 80 + 2 * len(recording.motions("constant", "windowed_sine"))
+    assert max(fitted[2:]) < min(fitted[:2])
+    assert whole is not None
+    assert bounded is not None
+    apart = bounded.fit.link_length_m[1] - whole.fit.link_length_m[1]
+    assert 0.0 < abs(apart) < 3.0 * sigma(bounded)
