@@ -4,7 +4,6 @@ from coordinator.runtime.command_line import lazy_app
 
 COMMANDS = {
     "run": ("run.run", "Identify a simulated robot and score the result."),
-    "launch": ("run.launch", "Run world, agents and coordinator with the live viewer."),
     "world": ("world.world", "Run the world of one robot for agents to attach to."),
     "fleet": ("fleet.fleet", "Run several robots on Zenoh routers, and measure what they cost."),
     "compile": ("compile.compile_kernels", "Compile all kernels, so that the first run does not."),
@@ -40,6 +39,7 @@ app = lazy_app(
     COMMANDS,
     EXAMPLES,
     # `robot` names a simulated robot here, not the one on the network.
+    aliases={"launch": "run.launch"},
     repeated=("listen", "secure", "quiet"),
 )
 

@@ -47,7 +47,6 @@ PATIENCE_S = 240
 # benchmarks and a whole run as they are.
 SHORTER = {
     "x5-sim run": ("--plan", "shorter.toml"),
-    "x5-sim launch": ("--plan", "shorter.toml"),
     "x5-coordinator run": ("--plan", "shorter.toml"),
     "x5-coordinator excite": ("--tries", "30"),
     "x5-sim benchmark kinematics": ("--trials", "1"),

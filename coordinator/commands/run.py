@@ -189,6 +189,6 @@ def _print_inertia(dynamics: DynamicsPart, terminal: Terminal) -> None:
     real = dynamics.bodies.held_out_relative_error if dynamics.bodies is not None else None
     terminal.note(
         f"inertia: {dynamics.rank} of {dynamics.parameters} parameters; error of predicted torque on "
-        f"held-out motions: {100 * dynamics.held_out.relative_error:.1f} %"
-        + ("" if real is None else f", by the bodies in the URDF: {100 * real:.1f} %")
+        f"held-out motions, rms: {dynamics.held_out.in_words()}"
+        + ("" if real is None else f", by the bodies in the URDF: {dynamics.held_out.in_words(real)}")
     )

@@ -30,6 +30,17 @@ class TorqueError(NamedTuple):
     samples: NDArray[np.int64]
 
 
+# Offsets and noise of a module's torque sensor are of this size (0.5 % of the largest torque, 13 Nm of an
+# X5-9): a percentage of a torque below it compares with noise.
+FAINT_NM = 0.1
+
+
+def error_in_words(error_nm: float, torque_nm: float) -> str:
+    """Return an rms error of torque [Nm] for people; as a percentage too, where the torque is no noise."""
+    share = f" ({100.0 * error_nm / torque_nm:.1f} %)" if torque_nm >= FAINT_NM else ""
+    return f"{error_nm:.3f} Nm of {torque_nm:.3f} Nm{share}"
+
+
 class HeldOut(NamedTuple):
     """A held-out motion with the torques that were measured and predicted, (m, n) [Nm], read-only."""
 

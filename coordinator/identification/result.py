@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
+from coordinator.dynamics.torque_prediction import error_in_words
 from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, ImuPlacePart, Part
 from module_agent.model.chain import Chain
 from module_agent.model.files import write_json
@@ -150,12 +151,20 @@ class DhPart(Part):
 
 
 class HeldOutPart(Part):
-    """Relative torque error of held-out motions: |e| / |tau|, 2-norms."""
+    """Relative torque error of held-out motions: |e| / |tau|, 2-norms; torque_rms_nm is |tau| per sample."""
 
     relative_error: float
     relative_error_per_joint: dict[str, float]
     mean_baseline: float
     samples: int
+    torque_rms_nm: float | None = None
+
+    def in_words(self, relative_error: float | None = None) -> str:
+        """Return the error, or another relative one of the same motions, for people."""
+        error = self.relative_error if relative_error is None else relative_error
+        if self.torque_rms_nm is None:  # a result of an earlier version
+            return f"{100.0 * error:.1f} %"
+        return error_in_words(error * self.torque_rms_nm, self.torque_rms_nm)
 
 
 class ModuleBodyPart(BodyPart):

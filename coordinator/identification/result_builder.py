@@ -264,4 +264,5 @@ def _held_out(held_out: HeldOutMotion, per_joint: dict[str, float]) -> HeldOutPa
         relative_error_per_joint={s: error for s, error in per_joint.items() if error == error},
         mean_baseline=held_out.error.mean_overall,
         samples=len(held_out.session_ns),
+        torque_rms_nm=float(np.sqrt(np.mean(held_out.tau_measured_nm**2))),
     )

@@ -176,9 +176,8 @@ def _sure_inertia(dynamics: DynamicsPart) -> Iterator[str]:
     yield f"{dynamics.rank} combinations of {dynamics.parameters} inertial parameters are determined."
     if dynamics.held_out is not None:
         yield (
-            "Torques of held-out motions are predicted within "
-            f"{100 * dynamics.held_out.relative_error:.2f} %; a constant would be off by "
-            f"{100 * dynamics.held_out.mean_baseline:.0f} %."
+            f"Torques of held-out motions are predicted within {dynamics.held_out.in_words()}, rms; "
+            f"a constant would be off by {dynamics.held_out.in_words(dynamics.held_out.mean_baseline)}."
         )
 
 

@@ -105,7 +105,9 @@ def lazy_app(
             command = _loaded(cmd_name, f"{package}.{place}")
             if example := examples.get(cmd_name):
                 command.epilog = f"Example: {example}"
-            _take_settings(command, ctx, repeated)
+            # Tools that only look at commands have no context.
+            if ctx is not None:
+                _take_settings(command, ctx, repeated)
             return command
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:

@@ -32,7 +32,7 @@ OFF = "off"
 
 _HEAD = f"""# Imperfections of the simulated module
 
-Every effect can be switched on its own: `--with NAME` and `--without NAME` of `x5-sim run`, `launch` and
+Every effect can be switched on its own: `--with NAME` and `--without NAME` of `x5-sim run` and
 `world`. A noise profile (`--noise`) is a set of them: `ideal` has perfect sensors on a rigid robot, `x5` is a
 module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has all of them, and
 larger ones. Sizes are one standard deviation where they differ between modules or samples, unless the model

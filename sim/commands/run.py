@@ -1,4 +1,4 @@
-"""`x5-sim run` and `launch`: the whole system on a simulated robot, in virtual time or as processes."""
+"""`x5-sim run`: the whole system on a simulated robot, in virtual time or as processes."""
 
 import signal
 import time
@@ -16,7 +16,7 @@ from coordinator.runtime.command_line import ENDINGS, end_if_suspect, ending, fa
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
 from coordinator.runtime.terminal import Terminal
 from coordinator.viewer.targets import NATIVE_PORT, proxy_url, viewer_choice
-from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_SUSPECT
+from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_SUSPECT, UsageError
 from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import score_run
 from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError, default_processes
@@ -24,6 +24,7 @@ from sim.robot.robot_file import RobotFileError
 from sim.scoring.truth_recording import add_truth
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
+Viewer = Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")]
 _note = partial(typer.echo, err=True)
 # Previews of larger robots are only assembled: their refinements would take longer than the run.
 MAX_REFINED_MODULES = 8
@@ -37,12 +38,20 @@ def run(
     virtual: Annotated[
         bool, typer.Option("--virtual", help="In one process, faster than real time.")
     ] = False,
+    viewer: Viewer = "none",
     quiet: Quiet = False,
 ) -> None:
-    """Identify a simulated robot and score the result against the truth."""
+    """Identify a simulated robot and score the result against the truth; Ctrl-C stops everything.
+
+    World, agents and coordinator are processes, or with --virtual one process on a virtual clock.
+    """
     if not virtual:
-        _launch(settings, launched, motions, None, *(("--quiet",) if quiet else ()))
+        _launch(settings, launched, motions, viewer, quiet)
         return
+    if viewer != "none":
+        raise UsageError(
+            f"--viewer {viewer}: with --virtual there is nothing live; look at session.rrd after it"
+        )
     robot = load(settings.robot)
     launched.check()
     config = VirtualConfig(
@@ -70,23 +79,24 @@ def launch(
     settings: WorldOptions,
     launched: LaunchOptions,
     motions: PlanOptions,
-    viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
+    viewer: Viewer = "spawn",
 ) -> None:
-    """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
-    choice = viewer_choice(viewer)
-    # Where the viewer can still be reached when the run is over.
-    reachable = proxy_url(NATIVE_PORT) if choice.spawn else choice.connect
-    _launch(settings, launched, motions, reachable, "--viewer", viewer)
+    """Do as `run --viewer spawn`, whose older name this is."""
+    _launch(settings, launched, motions, viewer, quiet=False)
 
 
 def _launch(
     settings: WorldOptions,
     launched: LaunchOptions,
     motions: PlanOptions,
-    viewer: str | None,
-    *coordinator_options: str,
+    viewer: str,
+    quiet: bool,
 ) -> None:
     """Run all processes, then score the result, and draw the truth in the recording and in the viewer."""
+    choice = viewer_choice(viewer)
+    # Where the viewer can still be reached when the run is over.
+    reachable = proxy_url(NATIVE_PORT) if choice.spawn else choice.connect
+    shown = ("--viewer", viewer, *(("--quiet",) if quiet else ()))
     robot = load(settings.robot)
     launched.check()
     # The noise, the plan and the pushes are checked here; coordinator and world read them again.
@@ -110,7 +120,7 @@ def _launch(
         physics=settings.physics or "pybullet",
         agent_options=("--imu", plan.imu),
         # The robot ends with this run, so that there is nothing to resume.
-        coordinator_options=("--no-advise", *reported, *coordinator_options, *motions.arguments()),
+        coordinator_options=("--no-advise", *reported, *shown, *motions.arguments()),
         out=launched.new_folder(robot),
         secure=launched.secure,
         safety=limits,
@@ -118,7 +128,7 @@ def _launch(
     if config.secure is not None:
         make_credentials(config.secure, robot.name, robot.serials, [s for s in config.shares if len(s) > 1])
     code = _run_processes(config)
-    add_truth(config.out, viewer, _note)
+    add_truth(config.out, reachable, _note)
     score_run(config.out)
     _print_report(config.out)
     if code:

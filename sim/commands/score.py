@@ -7,6 +7,7 @@ import typer
 from rich.table import Table
 
 from coordinator.commands.options import JsonFile
+from coordinator.dynamics.torque_prediction import FAINT_NM
 from coordinator.runtime.terminal import figure, new_table, print_table, write_result
 from module_agent.model.files import write_json
 from sim.scoring.score import Score, score
@@ -46,14 +47,29 @@ def table(result: Score) -> Table:
     shown.add_section()
     shown.add_row("tip position, rms", "", figure(result.tip_position_rms_mm, ".2f", " mm"), "", "")
     shown.add_row("tip orientation, rms", "", figure(result.tip_orientation_rms_deg, ".3f", " deg"), "", "")
-    shown.add_row("held-out torque against the true", "", figure(result.torque_relative_error, ".2%"), "", "")
-    for serial, error in (result.torque_relative_error_per_joint or {}).items():
-        absolute = (result.torque_rms_error_nm_per_joint or {}).get(serial)
-        shown_error = figure(absolute, ".3f", " Nm") if error is None else figure(error, ".2%")
-        shown.add_row(f"  of {serial}", "", shown_error, "", "")
-    measured = figure(result.torque_relative_error_measured, ".2%")
-    shown.add_row("held-out torque against the measured", "", measured, "", "")
+    _add_torques(shown, result)
     shown.add_section()
     shown.add_row("robot time", figure(result.robot_time_s, ".1f", " s"), "", "", "")
     shown.add_row("wall time", figure(result.wall_time_s, ".1f", " s"), "", "", "")
     return shown
+
+
+def _add_torques(shown: Table, result: Score) -> None:
+    """Add rows of rms torques [Nm]; percentages only of torques that are no noise."""
+
+    def row(what: str, error_nm: float | None, torque_nm: float | None) -> None:
+        error = figure(error_nm, ".3f", " Nm")
+        if error_nm is not None and torque_nm is not None and torque_nm >= FAINT_NM:
+            error += f" ({error_nm / torque_nm:.2%})"
+        shown.add_row(what, figure(torque_nm, ".3f", " Nm"), error, "", "")
+
+    def absolute(relative: float | None, torque_nm: float | None) -> float | None:
+        return None if relative is None or torque_nm is None else relative * torque_nm
+
+    true_nm, measured_nm = result.torque_rms_nm, result.measured_torque_rms_nm
+    row("held-out torque against the true, rms", absolute(result.torque_relative_error, true_nm), true_nm)
+    torques = result.torque_rms_nm_per_joint or {}
+    for serial, error_nm in (result.torque_rms_error_nm_per_joint or {}).items():
+        row(f"  of {serial}", error_nm, torques.get(serial))
+    measured = absolute(result.torque_relative_error_measured, measured_nm)
+    row("held-out torque against the measured, rms", measured, measured_nm)

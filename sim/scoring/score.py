@@ -55,7 +55,8 @@ class Score(BaseModel):
 
     Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame. Torque errors
     are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
-    joint whose true torque is below `MIN_TORQUE_NM` (rms); its error in Nm is given nevertheless.
+    joint whose true torque is below `MIN_TORQUE_NM` (rms); its error in Nm is given nevertheless, as are the
+    torques that the errors are relative to.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -70,6 +71,9 @@ class Score(BaseModel):
     torque_relative_error_per_joint: dict[str, float | None] | None = None
     torque_rms_error_nm_per_joint: dict[str, float] | None = None
     torque_relative_error_measured: float | None = None
+    torque_rms_nm: float | None = None
+    torque_rms_nm_per_joint: dict[str, float] | None = None
+    measured_torque_rms_nm: float | None = None
     robot_time_s: float
     wall_time_s: float | None
 
@@ -177,9 +181,10 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
 def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source: str) -> dict[str, Any]:
     """Return the fields of `Score` about torques."""
     measured = _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm)
+    size_measured = float(np.sqrt(np.mean(held_out.tau_measured_nm**2)))
     known = [column for column, serial in enumerate(serials) if serial in motion.serials]
     if not known:
-        return {"torque_relative_error_measured": measured}
+        return {"torque_relative_error_measured": measured, "measured_torque_rms_nm": size_measured}
     own = [serials[c] for c in known]
     true = np.column_stack([true_torque(motion, serials[c], held_out.t_ns[:, c], source) for c in known])
     predicted = held_out.tau_predicted_nm[:, known]
@@ -190,6 +195,9 @@ def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source
         "torque_relative_error_per_joint": dict(zip(own, relative, strict=True)),
         "torque_rms_error_nm_per_joint": dict(zip(own, error, strict=True)),
         "torque_relative_error_measured": measured,
+        "torque_rms_nm": float(np.sqrt(np.mean(true**2))),
+        "torque_rms_nm_per_joint": dict(zip(own, size, strict=True)),
+        "measured_torque_rms_nm": size_measured,
     }
 
 

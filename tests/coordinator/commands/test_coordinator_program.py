@@ -336,3 +336,12 @@ def test_a_hub_waits_for_agents_that_try_once_a_second(wire: Any) -> None:
     late = Late(wire, ("A",))
     statuses = listed(late, "arm", Search(quiet_s=0.02, min_s=20.0, expect=1), listen_s=0.1).statuses
     assert [status.serial for status in statuses] == ["A"]
+
+
+def test_a_payload_is_refused_at_once_where_nothing_was_weighed(known_folder: Any, tmp_path: Path) -> None:
+    """Before the robot moves: no recording is read, no network joined, no folder made."""
+    baseline = known_folder("thesis_171_horizontal", dynamics=None)
+    done = CliRunner().invoke(app, ["payload", str(baseline), "--out", str(tmp_path / "new")])
+    assert done.exit_code == 1
+    assert "--no-dynamics: a payload is what is more than a known inertia" in done.output
+    assert not (tmp_path / "new").exists()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from coordinator.dynamics.torque_prediction import check_held_out, torque_error
+from coordinator.dynamics.torque_prediction import check_held_out, error_in_words, torque_error
 from coordinator.parameter_fit.least_squares import solve_information
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
@@ -84,3 +84,8 @@ def test_parameters_from_noisy_samples_predict_another_motion() -> None:
     assert found.error.per_joint.max() < 0.03
     assert found.error.mean_overall > 10 * found.error.overall
     assert found.tau_predicted_nm.shape == held_out.tau_nm.shape
+
+
+def test_a_percentage_is_given_only_of_a_torque_that_is_no_noise() -> None:
+    assert error_in_words(0.05, 2.0) == "0.050 Nm of 2.000 Nm (2.5 %)"
+    assert error_in_words(0.051, 0.0165) == "0.051 Nm of 0.017 Nm"

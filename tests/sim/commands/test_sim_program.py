@@ -290,3 +290,11 @@ def test_logs_stay_in_the_folder_of_the_run_and_a_restarted_agent_has_its_own(be
     folder = bench.launcher.config.out / LOGS
     assert (folder / "world.log").read_text() == "world\n"
     assert (folder / names[3]).read_text() == f"agent {many}\n"
+
+
+def test_a_viewer_is_refused_where_nothing_is_live(tmp_path: Path) -> None:
+    arguments = ["run", ROBOT, "--virtual", "--viewer", "spawn", "--out", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 2
+    assert "with --virtual there is nothing live" in done.output
+    assert not (tmp_path / "run").exists()
