@@ -1,18 +1,23 @@
-"""`x5-coordinator monitor`: compare a moving robot with its baseline, live or from a recording."""
+"""`x5-coordinator monitor`: all modules in a live table, or a moving robot compared with its baseline."""
 
 import asyncio
 import contextlib
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from coordinator.baseline.baseline_robot import load_baseline
-from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
+from coordinator.commands.options import ConnectOptions, JsonFile, Speed
+from coordinator.commands.views.module_table import ModuleScreen
 from coordinator.commands.views.monitor import MonitorScreen
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.messenger import Messenger
 from coordinator.monitoring.live import UPDATE_S, LiveMonitor, retained_rows
+from coordinator.monitoring.live_states import LiveStates
+from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from coordinator.monitoring.monitor import Monitor
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Recording
@@ -20,6 +25,7 @@ from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import read_session
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
+from coordinator.runtime.key_presses import key_presses
 from coordinator.runtime.terminal import Terminal
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import EXIT_FINDING, DataError, RobotError, UsageError
@@ -31,8 +37,13 @@ _FIRST_FEEDBACK_S = 15.0
 
 @with_options
 def monitor_robot(
-    baseline: DynamicsFolder,
     at: ConnectOptions,
+    baseline: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder of an earlier run of this robot with dynamics, its baseline [a table of any robot]."
+        ),
+    ] = None,
     recording: Annotated[
         Path | None, typer.Option(help="Monitor a recorded session.mcap; needs no robot.")
     ] = None,
@@ -45,10 +56,15 @@ def monitor_robot(
     json_file: JsonFile = None,
     speed: Speed = 1.0,
 ) -> None:
-    """Monitor a robot that another program moves: report collisions, payloads, friction and wear.
+    """Monitor a robot: all its modules in a live table, or, if it is known, what happens while it moves.
 
-    Sends no commands and takes no lease. Exit codes: 0 no findings, 4 findings, others as of `run`.
+    Of a known robot collisions, payloads, friction and wear are reported. Nothing is commanded and no lease
+    is taken, but by the keys of the table: s stops all modules, h holds them where they are, q ends.
+    Exit codes: 0 no findings, 4 findings, others as of `run`.
     """
+    if baseline is None:
+        _show_modules(at, recording, for_s, json_file, speed)
+        return
     if recording is not None and not recording.is_file():
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     reference = build_reference(load_baseline(baseline))
@@ -62,6 +78,57 @@ def monitor_robot(
         screen.show_summary()
     if monitor.finding_log.all:
         raise typer.Exit(EXIT_FINDING)
+
+
+KEYS = "s stop all    h hold, or release    q end"
+
+
+def _show_modules(
+    at: ConnectOptions, recording: Path | None, for_s: float | None, json_file: Path | None, speed: float
+) -> None:
+    """Show all modules of a robot until the time is up, a key ends it, or a signal comes.
+
+    Raises:
+        UsageError: a recording is given, which has no modules to show.
+        RobotError: no module came.
+    """
+    if recording is not None:
+        raise UsageError(
+            "--recording needs a baseline: x5-coordinator monitor FOLDER --recording session.mcap"
+        )
+    place = at.place()
+    loop, states = ScaledLoop(speed), ModuleStates()
+    begin_ns = loop.clock_ns()
+    screen = ModuleScreen(place.robot, json_file, at.quiet, KEYS if sys.stdin.isatty() else "")
+    transport = open_connection(place, screen.note).transport
+    messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, states.record)
+    ended = False
+
+    def report(modules: Sequence[ModuleState]) -> None:
+        screen.show(modules, 1e-9 * (loop.clock_ns() - begin_ns))
+
+    def end() -> None:
+        nonlocal ended
+        ended = True
+
+    live = LiveStates(states, messenger, loop.clock_ns, new_sender(), report, screen.note)
+
+    async def follow() -> None:
+        messenger.start()
+        try:
+            first_ns = loop.clock_ns() + round(_FIRST_FEEDBACK_S * 1e9)
+            await live.follow(first_ns, lambda: ended or bool(states.recording.modules))
+            if states.recording.modules:
+                until_ns = None if for_s is None else begin_ns + round(for_s * 1e9)
+                await live.follow(until_ns, lambda: ended)
+        finally:
+            messenger.close()
+
+    keys = key_presses(loop, {"s": live.stop, "h": live.hold, "q": end})
+    with screen, keys, contextlib.suppress(asyncio.CancelledError):
+        attend(loop, follow())
+    if not states.recording.modules and not ended:
+        raise RobotError(f"no module of robot {place.robot!r} answers within {_FIRST_FEEDBACK_S:.0f} s")
 
 
 def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:

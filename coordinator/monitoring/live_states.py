@@ -1,0 +1,145 @@
+"""Follow all modules of a robot on its network: hear them, ask them, and stop or hold them when told to."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Sender, gather_all
+from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.monitoring.module_states import ModuleState, ModuleStates
+from module_agent.model.errors import RobotError
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import Ask, Stop
+
+# Period of the updates, and of the requests to every module, which are round trips for its clock as well.
+UPDATE_S, ASK_S = 0.25, 0.5
+
+Report = Callable[[Sequence[ModuleState]], None]
+Note = Callable[[str], None]
+
+
+class LiveStates:
+    """Follows modules over one messenger, which is given `states.record` to record with."""
+
+    def __init__(
+        self,
+        states: ModuleStates,
+        messenger: Messenger,
+        clock: Clock,
+        sender: Sender,
+        report: Report,
+        note: Note,
+    ):
+        self._states = states
+        self._messenger = messenger
+        self._clock = clock
+        self._sender = sender
+        self._report = report
+        self._note = note
+        self._described: set[tuple[str, int]] = set()
+        self._group: ModuleGroup | None = None
+        self._keeper: asyncio.Task[None] | None = None
+        self._work: set[asyncio.Task[None]] = set()
+
+    @property
+    def holds(self) -> bool:
+        """Whether this program holds the modules."""
+        return self._group is not None
+
+    async def follow(self, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False) -> None:
+        """Report all modules every `UPDATE_S` until a time [ns], until it is enough, or until cancelled.
+
+        What is held is released at the end.
+        """
+        asking = asyncio.create_task(self._ask_all())
+        try:
+            while (until_ns is None or self._clock() < until_ns) and not enough():
+                await asyncio.sleep(UPDATE_S)
+                self._report(self._states.at(self._clock(), self._messenger.alive))
+        finally:
+            asking.cancel()
+            await asyncio.gather(asking, *self._work, return_exceptions=True)
+            await self._release()
+
+    def stop(self) -> None:
+        """Stop every module at once; what was held is held no longer."""
+        self._do(self._stop())
+
+    def hold(self) -> None:
+        """Take the leases, so that every module holds its position; the second time, release them."""
+        self._do(self._release() if self.holds else self._hold())
+
+    def _do(self, work: Coroutine[None, None, None]) -> None:
+        async def attempt() -> None:
+            try:
+                await work
+            except RobotError as error:
+                self._note(str(error))
+
+        task = asyncio.create_task(attempt())
+        self._work.add(task)
+        task.add_done_callback(self._work.discard)
+
+    async def _stop(self) -> None:
+        serials = sorted(self._messenger.alive)
+
+        async def one(serial: str) -> None:
+            stop = Stop(
+                serial=serial,
+                boot=0,
+                seq=self._messenger.next_seq(),
+                sender=self._sender.name,
+                why="asked to",
+            )
+            await self._messenger.command(serial, Leaf.STOP, stop)
+
+        try:
+            await gather_all(one(serial) for serial in serials)
+            self._note(f"stopped: {', '.join(serials) or 'no module is there'}")
+        finally:
+            await self._release()
+
+    async def _hold(self) -> None:
+        group = self._group = ModuleGroup(self._messenger, self._states.recording, self._clock, self._sender)
+        try:
+            await group.meet(sorted(self._messenger.alive))
+            for serial in group.serials:
+                await group.acquire(serial)
+        except RobotError:
+            await self._release()
+            raise
+        self._keeper = asyncio.create_task(group.keep_alive())
+        self._keeper.add_done_callback(self._kept)
+        self._note(f"held: {', '.join(group.serials)}")
+
+    def _kept(self, keeper: "asyncio.Task[None]") -> None:
+        """Say why holding ended, if it was not asked to."""
+        if not keeper.cancelled() and (error := keeper.exception()) is not None:
+            self._note(f"held no longer: {error}")
+
+    async def _release(self) -> None:
+        group, self._group = self._group, None
+        if group is None:
+            return
+        if self._keeper is not None:
+            self._keeper.cancel()
+            await asyncio.gather(self._keeper, return_exceptions=True)
+            self._keeper = None
+        await group.release_all()
+        self._note("released")
+
+    async def _ask_all(self) -> None:
+        while True:
+            await asyncio.gather(*(self._ask(serial) for serial in sorted(self._messenger.alive)))
+            await asyncio.sleep(ASK_S)
+
+    async def _ask(self, serial: str) -> None:
+        # One that does not answer is seen by its silence.
+        with suppress(NoAnswer):
+            module = self._states.recording.modules.get(serial)
+            if module is None or module.info is None:
+                await self._messenger.ask(serial, Leaf.INFO, self._question(serial))
+            await self._messenger.ask(serial, Leaf.STATUS, self._question(serial))
+
+    def _question(self, serial: str) -> Ask:
+        return Ask(serial=serial, boot=0, seq=self._messenger.next_seq(), sender=self._sender.name)

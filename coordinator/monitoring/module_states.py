@@ -1,0 +1,179 @@
+"""What every module of a robot does now, as a table shows it: from its messages alone, without a model.
+
+Rates and delays are of the last ten seconds. A row's delay is from its sample, by the module's clock mapped
+to the session's, to the arrival of the message in which it is the newest one, so that the wait for a batch to
+fill is not in it.
+"""
+
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coordinator.recording.recording import Entry, ModuleRecord, Recording, RoundTrip
+from module_agent.model.chain import Array
+from module_agent.wire.messages import Feedback, Message
+
+WINDOW_NS = 10_000_000_000
+# What a session of days keeps of a module: ten seconds of rows at 1 kHz, and a minute of round trips.
+KEPT_ROWS, KEPT_TRIPS = 10_000, 240
+# Without a message for so long a module is silent.
+SILENT_NS = 1_000_000_000
+
+
+class ModuleState(NamedTuple):
+    """A module at one time; None where it is not known.
+
+    state: as the module says, or `silent`, or `gone` without its liveliness token. rows_per_s, delay_p50_ms,
+    delay_p99_ms: of the last ten seconds. lost_rows: since the module was heard first. refused: by reason.
+    """
+
+    serial: str
+    kind: str | None
+    state: str
+    holder: str | None
+    position_rad: float | None = None
+    velocity_rad_s: float | None = None
+    effort_nm: float | None = None
+    winding_temperature_c: float | None = None
+    voltage_v: float | None = None
+    rows_per_s: float = 0.0
+    lost_rows: int = 0
+    delay_p50_ms: float | None = None
+    delay_p99_ms: float | None = None
+    refused: Mapping[str, int] = MappingProxyType({})
+
+
+class _Delivery(NamedTuple):
+    """A feedback message: first row, number of rows, newest row's module time, session time of arrival."""
+
+    first_row: int
+    rows: int
+    row_ns: int
+    arrival_ns: int
+
+
+class _Deliveries:
+    """The feedback of one boot of a module: of the last ten seconds, and how many rows since the first."""
+
+    def __init__(self, boot: int, first_row: int):
+        self.boot = boot
+        self.latest: deque[_Delivery] = deque()
+        self._first_row = self._end_row = first_row
+        self._rows = 0
+        self._recent: set[int] = set()
+
+    @property
+    def lost(self) -> int:
+        """Rows between the first and the newest that have not come."""
+        return max(0, self._end_row - self._first_row - self._rows)
+
+    def add(self, new: _Delivery) -> None:
+        """Note a message; one that came before does not count again."""
+        if new.first_row in self._recent:
+            return
+        self._rows += new.rows
+        self._first_row = min(self._first_row, new.first_row)
+        self._end_row = max(self._end_row, new.first_row + new.rows)
+        self.latest.append(new)
+        self._recent.add(new.first_row)
+        self.drop_before(new.arrival_ns - WINDOW_NS)
+
+    def drop_before(self, arrival_ns: int) -> None:
+        """Forget what arrived before a time."""
+        while self.latest and self.latest[0].arrival_ns < arrival_ns:
+            self._recent.discard(self.latest.popleft().first_row)
+
+
+class ModuleStates:
+    """Follows all modules that are heard; times are session time [ns]."""
+
+    def __init__(self) -> None:
+        self.recording = Recording()
+        self._deliveries: dict[str, _Deliveries] = {}
+
+    def record(self, entry: Entry) -> Message | None:
+        """Take a message in; None if it cannot be read."""
+        message = self.recording.accept(entry)
+        if isinstance(message, Feedback) and entry.kind == "publication" and message.count:
+            module = self.recording.module(message.serial, message.boot)
+            newest = module.rows.rows(message.first_row, message.first_row + message.count)["t_ns"][-1:]
+            known = self._deliveries.get(message.serial)
+            if known is None or known.boot != message.boot:
+                known = self._deliveries[message.serial] = _Deliveries(message.boot, message.first_row)
+            for row_ns in newest.tolist():
+                known.add(_Delivery(message.first_row, message.count, row_ns, entry.t_ns))
+            if module.rows.end_row - module.rows.first_row > 2 * KEPT_ROWS:
+                module.forget(KEPT_ROWS, KEPT_TRIPS)
+        return message
+
+    def at(self, now_ns: int, alive: Collection[str]) -> list[ModuleState]:
+        """Return all modules by serial; `alive` are those whose liveliness token is on the network."""
+        return [
+            self._state(serial, now_ns, serial in alive)
+            for serial in sorted({*self.recording.modules, *alive})
+        ]
+
+    def _state(self, serial: str, now_ns: int, present: bool) -> ModuleState:
+        module = self.recording.modules.get(serial)
+        if module is None:
+            return ModuleState(serial, None, "silent", None)
+        status, info, known = module.status, module.info, self._deliveries.get(serial)
+        silent = module.feedback_ns is None or now_ns - module.feedback_ns > SILENT_NS
+        own = status.state if status is not None else "unknown"
+        state = ModuleState(
+            serial,
+            info.module_type if info is not None else None,
+            "gone" if not present else "silent" if silent else own,
+            status.holder if status is not None else None,
+            refused=dict(status.refusals) if status is not None else {},
+        )
+        latest = module.rows.rows(module.rows.end_row - 1, module.rows.end_row)
+        if len(latest):
+            shown: dict[str, Any] = {name: float(latest[name][0]) for name in _SHOWN}
+            state = state._replace(**shown)
+        if known is not None and known.boot == module.boot:
+            state = state._replace(lost_rows=known.lost, **_figures(module, known, now_ns))
+        return state
+
+
+_SHOWN = ("position_rad", "velocity_rad_s", "effort_nm", "winding_temperature_c", "voltage_v")
+
+
+def _figures(module: ModuleRecord, known: _Deliveries, now_ns: int) -> dict[str, Any]:
+    """Return the rate of rows, and percentiles of their delay as far as the clock is known."""
+    known.drop_before(now_ns - WINDOW_NS)
+    if not known.latest:
+        return {}
+    # From the arrival of the first message, whose rows are of the time before it.
+    first, *later = known.latest
+    span_ns = now_ns - first.arrival_ns
+    figures: dict[str, Any] = {}
+    if span_ns > 0:
+        figures["rows_per_s"] = 1e9 * sum(one.rows for one in later) / span_ns
+    delay_ms = _delays_ms(module.round_trips, known.latest)
+    if len(delay_ms):
+        p50, p99 = (float(value) for value in np.percentile(delay_ms, (50, 99)))
+        figures |= {"delay_p50_ms": p50, "delay_p99_ms": p99}
+    return figures
+
+
+def _delays_ms(trips: Sequence[RoundTrip], deliveries: Iterable[_Delivery]) -> Array:
+    """Return the delays of deliveries between the first and the last of the round trips.
+
+    The clock is interpolated between the middles of successive trips, by each of which it is off by at most
+    half the trip: one line through all of them would be wrong by much more where a simulated world falls
+    behind its machine, and stretches the modules' clocks unevenly.
+    """
+    if len(trips) < 2:
+        return np.zeros(0)
+    sent_ns, received_ns, module_ns = np.array(sorted(trips, key=lambda trip: trip.module_ns), np.int64).T
+    row_ns, arrival_ns = np.array([(one.row_ns, one.arrival_ns) for one in deliveries], np.int64).T
+    within = (row_ns >= module_ns[0]) & (row_ns <= module_ns[-1])
+    # Relative times, since a float does not resolve years to the nanosecond.
+    zero_ns, begin_ns = module_ns[0], sent_ns[0]
+    middle = 0.5 * ((sent_ns - begin_ns) + (received_ns - begin_ns))
+    sampled = np.interp((row_ns[within] - zero_ns).astype(float), (module_ns - zero_ns).astype(float), middle)
+    return np.asarray(1e-6 * ((arrival_ns[within] - begin_ns) - sampled))
