@@ -41,7 +41,7 @@ class QuietRun:
         ticks = _run(
             state,
             number,
-            most if world.can_run_ahead else 1,
+            most,
             u,
             self._alive,
             quiet.begin_run(busy),

@@ -206,15 +206,15 @@ class VirtualRobot:
         """Let all agents tick, with the loops of their modules."""
         hosts, quiet = list(self.hosts.items()), self._quiet
         busy = [place for _, host in hosts for place in host.collect()]
-        if self.on_tick or not self.world.can_run_ahead:
+        if self.on_tick or not self.truth.can_run_ahead:
             readings = self.truth.exchange(self.pwm)
             results = quiet.run(readings, busy)
         else:
+            readings = self.world.readings
             alone = not busy and not any(host.has_work for _, host in hosts)
             alive = [self._index[serial] for serial, _ in hosts]
             ticks, results = self._run.run(self.pwm, alive, busy, self._ticks_alone() if alone else 1)
             self.loop.pass_ns((ticks - 1) * TICK_NS)
-            readings = self.world.readings
         for serial, host in hosts:
             if results[self._index[serial]] != QUIET or host.has_work:
                 host.finish(readings, results)

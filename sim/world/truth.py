@@ -131,6 +131,11 @@ class TruthLog:
         keep_truth(self._world.plant_rows, self._world.t_ns - TICK_NS, self.begin_run(1))
         return samples
 
+    @property
+    def can_run_ahead(self) -> bool:
+        """Whether a kernel can do what `exchange` does, for any number of ticks."""
+        return type(self).exchange is TruthLog.exchange and self._world.can_run_ahead
+
     def begin_run(self, ticks: int) -> tuple[Any, ...]:
         """Return arrays with room for so many ticks: times, rows, and counts, as `keep_truth` takes them."""
         rows = self._counts[1] + ticks
