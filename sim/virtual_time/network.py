@@ -125,7 +125,8 @@ class VirtualNetwork:
         self._declared: dict[str, dict[Declaration, tuple[str, VirtualEndpoint]]] = {
             kind: {} for kind in ("sample", "request", "token", "liveness")
         }
-        self._routes: dict[str, tuple[Declaration, ...]] = {}
+        # What matches a key, until something else is declared.
+        self._routes: dict[tuple[str, str], tuple[Declaration, ...]] = {}
         self._questions: dict[Question, VirtualEndpoint] = {}
 
     def endpoint(self, name: str) -> VirtualEndpoint:
@@ -154,10 +155,10 @@ class VirtualNetwork:
     # The methods below are called by the endpoints and declarations of this module only.
 
     def _publish(self, endpoint: VirtualEndpoint, key: str, payload: bytes) -> None:
-        route = self._routes.get(key)
+        route = self._routes.get(("sample", key))
         if route is None:
             _check(key)
-            route = self._routes[key] = self._matching("sample", key)
+            route = self._matching("sample", key)
         if type(payload) is not bytes:
             _check(key, payload)
         self._note(endpoint, "sample", key, payload)
@@ -198,9 +199,8 @@ class VirtualNetwork:
         tokens = self._tokens()
         declaration = Declaration(sink, partial(self._withdraw, kind))
         self._declared[kind][declaration] = key_expr, endpoint
-        if kind == "sample":
-            self._routes.clear()
-        elif kind == "token" and key_expr not in tokens:
+        self._routes.clear()
+        if kind == "token" and key_expr not in tokens:
             self._announce(key_expr, True)
         elif kind == "liveness":
             for key in tokens:
@@ -212,9 +212,8 @@ class VirtualNetwork:
         if declaration not in self._declared[kind]:
             return
         key_expr, _ = self._declared[kind].pop(declaration)
-        if kind == "sample":
-            self._routes.clear()
-        elif kind == "token" and key_expr not in self._tokens():
+        self._routes.clear()
+        if kind == "token" and key_expr not in self._tokens():
             self._announce(key_expr, False)
 
     def _close(self, endpoint: VirtualEndpoint, answer: bool) -> None:
@@ -237,7 +236,11 @@ class VirtualNetwork:
             self._soon(lambda: _deliver(watches, Liveness(key, alive)))
 
     def _matching(self, kind: str, key: str) -> tuple[Declaration, ...]:
-        return tuple(d for d, (key_expr, _) in self._declared[kind].items() if matches(key_expr, key))
+        route = self._routes.get((kind, key))
+        if route is None:
+            declared = self._declared[kind].items()
+            route = self._routes[kind, key] = tuple(d for d, (expr, _) in declared if matches(expr, key))
+        return route
 
     def _note(self, sender: VirtualEndpoint, kind: str, key: str, payload: bytes) -> None:
         if self._tap is not None:
