@@ -15,6 +15,7 @@ from coordinator.recording.recording import Recording
 from coordinator.runtime.event_loop import end_tasks
 from coordinator.session.run import Run, RunConfig
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
+from sim.physics.engine import Physics
 from sim.robot.robot_file import load_robot
 from sim.virtual_time.cable import Cable, CableState
 from sim.virtual_time.loop import VirtualLoop
@@ -55,6 +56,7 @@ class Rig(VirtualRobot):
         noise: str = "x5",
         beside: "Rig | None" = None,
         hebi_rate_hz: float | None = None,
+        physics: Physics | None = None,
         **firmware: Any,
     ):
         self._guest = beside is not None
@@ -62,7 +64,9 @@ class Rig(VirtualRobot):
         loop = VirtualLoop() if beside is None else beside.loop
         shared = VirtualNetwork(loop, tap) if beside is None else beside.network
         impaired = PROFILES[network] if isinstance(network, str) else network
-        settings = VirtualSettings(load_robot(robot), impaired, seed, noise, hebi_rate_hz=hebi_rate_hz)
+        settings = VirtualSettings(
+            load_robot(robot), impaired, seed, noise, hebi_rate_hz=hebi_rate_hz, physics=physics
+        )
         super().__init__(settings, loop, shared, **firmware)
         self.start()
 

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,12 @@ HORIZONTAL, VERTICAL = "thesis_171_horizontal", "thesis_171_vertical"
 LIFETIME_NS = 250_000_000
 TICK_NS = 1_000_000
 BRISK = WindowedSine(amplitude=0.12, frequency_hz=1.0, centre_s=1.5, sigma_s=1.0)
+
+
+@pytest.fixture(params=["compiled", "pybullet"])
+def rigs(rigs: Callable[..., Any], request: pytest.FixtureRequest) -> Callable[..., Any]:
+    """Makes rigs; every test is run with both engines."""
+    return partial(rigs, physics=request.param)
 
 
 class Blackbox:
