@@ -1,0 +1,119 @@
+"""How the processor time of the batch refinement grows with the modules: figures to read.
+
+A serial robot of random modules and links, each joint moved alone while the others give and the base rocks,
+sampled as in a session: encoders with steps, IMUs as delivered. 64 modules have a third of the samples a
+joint, for the memory of the recording; the refinement thins all of them to the same number.
+"""
+
+import time
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, read
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
+from coordinator.batch_estimation.sensor_data import BaseMotion, NoiseFloor
+from coordinator.identification.robot_refinement import refine_checked
+from coordinator.synchronisation.motion_windows import RATE_HZ, STEP_NS, Window
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import UNCALIBRATED
+from module_agent.model.perturbation import apply_perturbation
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
+from tests.benchmarks.bars import report
+from tests.random_chains import build, random_robot
+
+pytestmark = pytest.mark.benchmark
+
+# Noise of gyros and accelerometers behind the low-pass, and of the encoders' steps.
+GYRO, ACCEL, STEP_RAD = 4e-4, 8e-3, 2e-5
+SAMPLES, SAMPLES_OF_64 = 1660, 550
+BARS_S = {7: 4.0, 16: 15.0, 32: 60.0, 64: None}
+
+
+class _Fit(NamedTuple):
+    cpu_s: float
+    error_mm: float
+    sigma_mm: float
+
+
+def _robot(joints: int) -> tuple[Chain, list[ModuleType]]:
+    chain, types = random_robot(40, joints, serial=True)
+    mounted = [False, *chain.reversed[1:]]
+    return build(
+        list(chain.parent), mounted, np.array(chain.imu_home), types, np.array([0.2, 0.1, 1.0])
+    ), types
+
+
+def _window(chain: Chain, joint: int, samples: int, errors: ImuIntrinsics) -> Window:
+    """One joint's windowed sine at 1 Hz; the others give by a hundredth of it."""
+    rng = np.random.default_rng((joint, 11))
+    t, count = np.arange(samples) / RATE_HZ, len(chain.serials)
+    share = rng.normal(0.0, 0.01, count)
+    share[joint] = 0.4
+    bump = np.sin(np.pi * t / t[-1]) ** 2 * np.sin(2.0 * np.pi * 1.1 * t)
+    moving = [np.outer(one, share) for one in _derivatives(bump)]
+    rocking = _derivatives(2e-3 * np.outer(bump, rng.normal(size=3)))
+    force = np.outer(bump, rng.normal(0.0, 0.1, 3))
+    base = BaseMotion(rocking[1], rocking[2], force)
+    ideal = readings_on(chain, body_motions(chain, moving[0], moving[1], moving[2], base))
+    gyro, accel = read(errors, *ideal, None)
+    gyro, accel = gyro + rng.normal(0.0, GYRO, gyro.shape), accel + rng.normal(0.0, ACCEL, accel.shape)
+    q = np.round(moving[0] / STEP_RAD) * STEP_RAD
+    return Window(np.arange(samples) * STEP_NS, q, np.zeros_like(q), gyro, accel, np.full(count, STEP_RAD))
+
+
+def _derivatives(signal: Array) -> tuple[Array, Array, Array]:
+    first = np.gradient(signal, 1.0 / RATE_HZ, axis=0, edge_order=2)
+    return signal, first, np.gradient(first, 1.0 / RATE_HZ, axis=0, edge_order=2)
+
+
+@cache
+def _fit(joints: int) -> _Fit:
+    """The processor time of a whole refinement, and how far off its lengths are, rms, against their claim."""
+    chain, types = _robot(joints)
+    rng = np.random.default_rng(joints)
+    errors = ImuIntrinsics(rng.normal(size=(joints, len(UNCALIBRATED.sigmas))) * UNCALIBRATED.sigmas)
+    errors.errors[:, 24] = 0.0
+    samples = SAMPLES if joints < 64 else SAMPLES_OF_64
+    windows = [_window(chain, joint, samples, errors) for joint in range(joints)]
+    noise = np.broadcast_to(np.array([GYRO, ACCEL])[:, None, None], (2, joints, joints))
+    floor = NoiseFloor(np.full(3, GYRO**2), np.full(3, ACCEL**2), REFINEMENT_CUTOFF_HZ)
+    off = rng.normal(0.0, 0.01, (joints, 6))
+    off[:, 3:] += np.cross(chain.imu_home[:, :3, 3], off[:, :3])
+    off[0] = 0.0
+    start = apply_perturbation(chain, off.ravel())
+    begun = time.process_time()
+    refined, _ = refine_checked(start, types, windows, UNCALIBRATED, floor, None, noise)
+    cpu_s = time.process_time() - begun
+    true = true_lengths(chain)
+    error = (refined.estimate.link_length_m - true)[1:]
+    sigma = refined.estimate.link_length_sigma_m[1:]
+    return _Fit(cpu_s, 1e3 * float(np.sqrt(np.mean(error**2))), 1e3 * float(np.sqrt(np.mean(sigma**2))))
+
+
+def true_lengths(chain: Chain) -> Array:
+    """Lengths (n,) as `ChainEstimate.link_length_m` has them."""
+    off = chain.imu_home[:, :3, 3] - chain.point[list(chain.parent)]
+    axis = chain.axis[list(chain.parent)]
+    return np.asarray(np.linalg.norm(np.cross(axis, off), axis=1))
+
+
+@pytest.mark.parametrize("joints", [7, 16, 32, 64])
+def test_time_of_the_refinement(joints: int) -> None:
+    fit = _fit(joints)
+    report(
+        f"refinement of {joints} modules, CPU",
+        fit.cpu_s,
+        "s",
+        at_most=BARS_S[joints],
+        anchor=f"lengths off by {fit.error_mm:.1f} mm, claimed {fit.sigma_mm:.1f}",
+    )
+
+
+@pytest.mark.parametrize(("few", "many"), [(7, 16), (16, 32), (32, 64)])
+def test_exponent_of_the_refinement(few: int, many: int) -> None:
+    exponent = np.log(_fit(many).cpu_s / _fit(few).cpu_s) / np.log(many / few)
+    report(f"refinement, exponent of the time from {few} to {many} modules", exponent, at_most=2.0)
