@@ -146,7 +146,7 @@ def mutants(run: bool) -> int:
         print(f"{waiting} are not checked: run it again, it goes on where it has stopped")
     for name, one in open_ones.items():
         print(f"\n{decided[name]}, not explained: {name}\n  {one.where}\n- {one.was}\n+ {one.becomes}")
-    for one in reasons.keys() - set(survivors.values()):
+    for one in () if waiting else reasons.keys() - set(survivors.values()):
         print(f"explained, and no survivor any more: {one.where}: {one.was!r} -> {one.becomes!r}")
     return 1 if open_ones or waiting or not decided else 0
 
