@@ -119,7 +119,7 @@ def _show_modules(
             first_ns = loop.clock_ns() + round(_FIRST_FEEDBACK_S * 1e9)
             await live.follow(first_ns, lambda: ended or bool(states.recording.modules))
             if states.recording.modules:
-                until_ns = None if for_s is None else begin_ns + round(for_s * 1e9)
+                until_ns = None if for_s is None else loop.clock_ns() + round(for_s * 1e9)
                 await live.follow(until_ns, lambda: ended)
         finally:
             messenger.close()
