@@ -107,8 +107,8 @@ class HebiModules:
     def receive(self) -> list[ModuleSample]:
         """Wait until the next tick is due, ask the modules for their feedback, return one sample per module.
 
-        A module that does not answer keeps its last sample, whose time goes on slowly; a few times in a row
-        are a fault.
+        A module that does not answer keeps its last sample, whose time all but stands still; a few times in a
+        row are a fault.
 
         Raises:
             HardwareLost: no module has answered for `LOST_AFTER_S`, or this is closed.
@@ -264,7 +264,6 @@ class _Link:
         self.limits = LimitState.NONE
         self.m_stop = False
         self.is_off_after_m_stop = False
-        self._tick_ns = information.tick_ns
         self._check = SampleCheck(module_type(information.module_type))
         self._sequence = 0
         self._misses = 0
@@ -283,12 +282,12 @@ class _Link:
         return self._sample(self._fault)
 
     def without_feedback(self) -> ModuleSample:
-        """Return the sample of a tick without feedback: the last one, later by half a tick.
+        """Return the sample of a tick without feedback: the last one, later by next to nothing.
 
-        A module's clock has moved on by a whole one, so its next time is later in any case.
+        A time that overtook the module's clock would let that go back with the next feedback.
         """
         self._misses += 1
-        self._last = self._last._replace(t_ns=self._last.t_ns + self._tick_ns // 2)
+        self._last = self._last._replace(t_ns=self._last.t_ns + 1)
         return self._sample(
             f"no feedback in {self._misses} ticks" if self._misses > MAX_HELD else self._fault
         )
