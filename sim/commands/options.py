@@ -24,7 +24,7 @@ from sim.robot.robot_file import Robot, load_robot
 from sim.world.external_force import Push, check_pushed, parse_push
 from sim.world.world import check_imu_rate
 
-RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
+RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML or HRDF file.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all noise.")]
 With = Annotated[
     list[str] | None, typer.Option("--with", help="Switch an effect on; repeat. `x5-sim effects` lists them.")

@@ -252,7 +252,7 @@ def shipped_robots() -> tuple[str, ...]:
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
-    """Load a shipped robot by name, or a robot file by path.
+    """Load a shipped robot by name, or a robot file by path: TOML, or the manufacturer's HRDF.
 
     Raises:
         RobotFileError: the file is invalid; the message names file, line and key.
@@ -264,6 +264,11 @@ def load_robot(name_or_path: str | Path) -> Robot:
             f"{name_or_path} is neither a robot file nor a shipped robot"
             f"{did_you_mean(str(name_or_path), shipped_robots())}; shipped are {', '.join(shipped_robots())}"
         )
+    if path.suffix.lower() == ".hrdf":
+        # Imported here: it makes what this file defines.
+        from sim.robot.hrdf_reader import read_hrdf
+
+        return read_hrdf(path)
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
