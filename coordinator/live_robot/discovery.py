@@ -9,10 +9,11 @@ from typing import NamedTuple, TypeVar
 
 from coordinator.live_robot.messenger import Clock, Messenger
 from coordinator.recording.recording import Entry, Recording
+from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Event, Liveness, Reply, Sample, Transport
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Ask, Message, Status, Stop
+from module_agent.wire.messages import Ack, Ask, Identify, Info, Message, Status, Stop
 from module_agent.wire.refusal import WireError
 
 ANSWER_S = 1.0
@@ -169,6 +170,35 @@ def _record(recording: Recording, open_tags: set[int], t_ns: int, event: Event) 
             recording.accept(Entry("reply", event.key, t_ns, event.payload))
     elif isinstance(event, Sample):
         recording.accept(Entry("publication", event.key, t_ns, event.payload))
+
+
+def described(transport: Transport, robot: str, search: Search) -> tuple[list[Info], list[str]]:
+    """Return what modules tell of themselves, and the serials without an answer. Closes the transport."""
+
+    def request(serial: str) -> Ask:
+        return Ask(serial=serial, boot=0, seq=1, sender="gains")
+
+    serials, answers = _ask_all(transport, robot, search, Leaf.INFO, request, Info)
+    return [answers[s] for s in serials if s in answers], [s for s in serials if s not in answers]
+
+
+def light_led(transport: Transport, robot: str, serial: str, sender: str, on: bool, search: Search) -> None:
+    """Light a module's LED, or give it back to the module. Leaves the transport open.
+
+    Raises:
+        RobotError: there is no such module, or it does not confirm.
+    """
+    if on and serial not in (there := _present(transport, robot, search)):
+        raise RobotError(f"no module {serial} of robot {robot!r}; there are {', '.join(there) or 'none'}")
+    events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+    request = encode(Identify(serial=serial, boot=0, seq=1, sender=sender, on=on))
+    transport.query(key(robot, serial, Leaf.IDENTIFY), request, ANSWER_S, events.put, 0)
+    event = events.get(timeout=ANSWER_S + 5.0)
+    if not isinstance(event, Reply) or event.payload is None:
+        raise RobotError(f"module {serial} does not confirm that its LED is {'lit' if on else 'off'}")
+    ack = decode(Ack, event.payload)
+    if not ack.accepted:
+        raise RobotError(f"module {serial} refuses: {ack.reason}: {ack.detail}")
 
 
 def stop_robot(transport: Transport, robot: str, sender: str, search: Search) -> tuple[list[str], list[str]]:

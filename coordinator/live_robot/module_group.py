@@ -317,9 +317,11 @@ class ModuleGroup:
 
     # ------------------------------------------------------------------ motions
 
-    async def set_gains(self, serial: str, gains: GainSet) -> None:
-        """Replace a module's gains."""
-        await self._achieve(serial, Leaf.GAINS, lambda: self._command(GainsCommand, serial, gains=gains))
+    async def set_gains(self, serial: str, gains: GainSet, keep: bool = False) -> None:
+        """Replace a module's gains, until the end of the lease or, to `keep`, of its boot."""
+        await self._achieve(
+            serial, Leaf.GAINS, lambda: self._command(GainsCommand, serial, gains=gains, keep=keep)
+        )
 
     def stream(
         self, serial: str, position_rad: float | None, velocity_rad_s: float | None, effort_nm: float | None

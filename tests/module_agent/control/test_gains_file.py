@@ -1,0 +1,117 @@
+"""Gains files go in and come out with the same meaning, by our reading and by hebi-py's."""
+
+from pathlib import Path
+
+import pytest
+
+from module_agent.control.gains import default_gains
+from module_agent.control.gains_file import LOOPS, STRATEGIES, GainsFileError, read_gains, write_gains
+from module_agent.hardware import hebi_library
+from module_agent.model.catalogue import module_type
+from module_agent.model.errors import UsageError
+from module_agent.wire.messages import GainSet, PidGains
+
+FACTORY = [default_gains(module_type("X5-9"), 3), default_gains(module_type("X5-4"), 4)]
+
+# In another order than the writer's, partial, with infinite limits and a value for all modules.
+DOCUMENTED = """<?xml version="1.0" encoding="UTF-8"?>
+<group_gains>
+  <effort>
+    <kd>0.001</kd>
+    <min_output>-inf -1</min_output>
+    <max_output>inf\t1</max_output>
+  </effort>
+  <position>
+    <output_lowpass>1 0.5</output_lowpass>
+    <kp>
+      15
+      10.5
+    </kp>
+    <d_on_error>0 1</d_on_error>
+  </position>
+  <control_strategy>4 Strategy2</control_strategy>
+</group_gains>
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "gains.xml"
+    path.write_text(DOCUMENTED)
+    return path
+
+
+def test_a_partial_file_changes_what_it_says_and_nothing_else(file: Path) -> None:
+    first, second = read_gains(file, FACTORY)
+    assert (first.strategy, second.strategy) == (4, 2)
+    assert (first.position.kp, second.position.kp) == (15.0, 10.5)
+    assert (first.position.d_on_error, second.position.d_on_error) == (False, True)
+    assert (first.effort.max_output, second.effort.min_output) == (1e6, -1.0)
+    assert first.velocity == FACTORY[0].velocity
+    assert (
+        second.position.model_copy(update={"kp": FACTORY[1].position.kp, "output_lowpass": 1.0})
+        == FACTORY[1].position
+    )
+
+
+def test_what_is_written_is_read_again(file: Path, tmp_path: Path) -> None:
+    gains = read_gains(file, FACTORY)
+    write_gains(tmp_path / "out.xml", gains)
+    assert read_gains(tmp_path / "out.xml", FACTORY) == gains
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<group_gains><position><kp>1 2 3</kp></position></group_gains>", "<kp> has 3 values for 2 modules"),
+        ("<group_gains><position><kq>1</kq></position></group_gains>", "unknown element <kq> in <position>"),
+        ("<group_gains><position><kp>x</kp></position></group_gains>", "position.kp: 'x' is no number"),
+        ("<group_gains><position><kp>nan</kp></position></group_gains>", "'nan' is no number"),
+        ("<group_gains><torque/></group_gains>", "unknown element <torque>"),
+        ("<group_gains><control_strategy>5</control_strategy></group_gains>", "control strategy '5'"),
+        ("<group_gains><effort><i_clamp>-1</i_clamp></effort></group_gains>", "effort.i_clamp = -1.0"),
+        ("<robot/>", "its root is <robot>"),
+        ("<group_gains>", "no gains file can be read"),
+    ],
+)
+def test_what_is_wrong_is_named(file: Path, text: str, message: str) -> None:
+    file.write_text(text)
+    with pytest.raises(GainsFileError) as error:
+        read_gains(file, FACTORY)
+    assert message in str(error.value)
+    assert str(file) in str(error.value)
+
+
+def test_hebi_py_reads_our_files_and_we_read_its(tmp_path: Path) -> None:
+    try:
+        hebi = hebi_library.library()
+    except UsageError:
+        pytest.skip("hebi-py is not installed")
+    path = tmp_path / "gains.xml"
+    write_gains(path, FACTORY)
+    command = hebi.GroupCommand(2)
+    command.read_gains(str(path))
+    for index, gains in enumerate(FACTORY):
+        assert command.control_strategy[index] == gains.strategy
+        for loop in LOOPS:
+            _same(command, index, loop, getattr(gains, loop))
+    command.write_gains(str(tmp_path / "theirs.xml"))
+    theirs = read_gains(tmp_path / "theirs.xml", [_other(one) for one in FACTORY])
+    for own, read in zip(FACTORY, theirs, strict=True):
+        assert STRATEGIES[read.strategy] == STRATEGIES[own.strategy]
+        for loop in LOOPS:
+            # hebi-py keeps 32-bit numbers.
+            assert getattr(read, loop).model_dump() == pytest.approx(
+                getattr(own, loop).model_dump(), rel=1e-6
+            )
+
+
+def _same(command: object, index: int, loop: str, gains: PidGains) -> None:
+    for name, value in gains:
+        told = float(getattr(command, f"{loop}_{name}")[index])
+        told = min(max(told, -1e6), 1e6)
+        assert told == pytest.approx(float(value), rel=1e-6), f"{loop}.{name}"
+
+
+def _other(gains: GainSet) -> GainSet:
+    return default_gains(module_type("X5-1"), 0 if gains.strategy else 1)

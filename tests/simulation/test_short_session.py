@@ -1,0 +1,62 @@
+"""Gains given to modules stay when the lease ends, and links are checked, over the driver too."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from coordinator.live_robot.discovery import Search
+from coordinator.live_robot.messenger import Sender
+from coordinator.live_robot.short_session import ShortSession
+from module_agent.model.errors import RobotError
+from module_agent.wire.messages import GainSet
+from tests.rig import SECRET
+
+ROBOT = "thesis_171_horizontal"
+SERIALS = ("X-00010", "X-00009")
+
+
+def softer(present: Sequence[GainSet]) -> list[GainSet]:
+    return [
+        own.model_copy(update={"position": own.position.model_copy(update={"kp": 0.25 * (k + 1)})})
+        for k, own in enumerate(present)
+    ]
+
+
+def session(rig: Any, serials: Sequence[str] = ()) -> ShortSession:
+    clock = rig.endpoint("tester"), ROBOT, lambda: rig.loop.now_ns, rig.loop.call_soon
+    return ShortSession(*clock, Sender("tester", SECRET), Search(), serials)
+
+
+@pytest.mark.parametrize("rate_hz", [None, 250.0], ids=["direct", "driver"])
+def test_gains_go_to_the_modules_in_the_order_of_the_file_and_stay(
+    rigs: Callable[..., Any], rate_hz: float | None
+) -> None:
+    rig = rigs(ROBOT, "lan", hebi_rate_hz=rate_hz)
+    loaded = rig.run(session(rig, SERIALS).load_gains(softer))
+    assert loaded == SERIALS
+    for number, serial in enumerate(SERIALS, start=1):
+        (module,) = rig.hosts[serial].modules
+        assert module.firmware.state == "idle"
+        assert module.firmware.lease.holder is None
+        (told,) = rig.hosts[serial]._hardware.information
+        assert told.gains.position.kp == 0.25 * number
+        if rig.hebi is not None:
+            assert rig.hebi.named("simulated", [serial])[0].gains.position.kp == 0.25 * number
+
+
+def test_a_module_that_is_not_there_is_named_with_those_that_are(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ROBOT, "lan")
+    with pytest.raises(RobotError, match="there are X-00009, X-00010"):
+        rig.run(session(rig, ("X-1",)).load_gains(softer))
+
+
+@pytest.mark.parametrize("rate_hz", [None, 250.0], ids=["direct", "driver"])
+def test_a_link_is_checked_without_a_lease(rigs: Callable[..., Any], rate_hz: float | None) -> None:
+    rig = rigs(ROBOT, "lan", hebi_rate_hz=rate_hz)
+    told: list[str] = []
+    rig.run(session(rig).check_link(1.0, told.append))
+    assert [line.split()[0] for line in told] == sorted(SERIALS)
+    # 250 rows a second in batches of 5.
+    assert all(245.0 <= float(line.split()[2]) <= 255.0 for line in told), told
+    assert all(rig.state(serial) == "idle" for serial in SERIALS)
