@@ -19,7 +19,8 @@ from sim.virtual_time.session import record_session
 from sim.world.truth import Motion, Truth, truth_of
 
 ROBOT = "a2085_04"
-SEED = 1
+# One draw of the noise says little of either.
+SEEDS = (1, 2)
 # Errors through the driver over those without it.
 MOST = 1.5
 RATE_HZ = 250.0
@@ -30,7 +31,7 @@ LIFETIME_NS = 250_000_000
 LATE_NS = 4_000_000 + 2_000_000
 
 
-def errors_mm(plan: Plan, rate_hz: float | None) -> tuple[float, float]:
+def errors_mm(seed: int, plan: Plan, rate_hz: float | None) -> tuple[float, float]:
     """Identify the robot, through the driver at a rate or without it; return rms errors of links and tip."""
     ended: list[tuple[Truth, Motion]] = []
 
@@ -39,7 +40,7 @@ def errors_mm(plan: Plan, rate_hz: float | None) -> tuple[float, float]:
         assert (drivers == {HebiModules}) == (rate_hz is not None)
         ended.append((truth_of(robot.robot, robot.world), robot.truth.motion()))
 
-    settings = VirtualSettings(load_robot(ROBOT), PROFILES["lan"], SEED, "x5", hebi_rate_hz=rate_hz)
+    settings = VirtualSettings(load_robot(ROBOT), PROFILES["lan"], seed, "x5", hebi_rate_hz=rate_hz)
     found = identify(record_session(settings, plan, at_end))
     score = score_identified(found, ended[0][0].chain, ended[0][1])
     assert score.topology_correct, score.topology_differences
@@ -48,7 +49,10 @@ def errors_mm(plan: Plan, rate_hz: float | None) -> tuple[float, float]:
 
 
 def test_topology_links_and_tip_are_as_good_as_without_the_driver(quick_plan: Plan) -> None:
-    direct, driven = (np.array(errors_mm(quick_plan, rate)) for rate in (None, RATE_HZ))
+    direct, driven = (
+        np.sqrt(np.mean([np.square(errors_mm(seed, quick_plan, rate)) for seed in SEEDS], axis=0))
+        for rate in (None, RATE_HZ)
+    )
     assert np.all(driven < MOST * direct), f"links and tip {driven} mm, without the driver {direct} mm"
 
 
