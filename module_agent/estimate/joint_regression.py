@@ -148,10 +148,15 @@ def regress_joint(
             joint. Else the covariance holds how much a load off that plane may bend and twist the link.
 
     Raises:
-        DataError: no motion, too few samples of one, or an IMU that did not move with the joint.
+        DataError: no motion, too few samples of one, an IMU that did not move with the joint, or one whose
+            readings no motion of the joint explains.
     """
     problem, guess = _problem(motions, rest, knowledge)
-    state, covariance = _minimise(problem, guess)
+    # A sensor at the end of its range can take the fit anywhere.
+    with np.errstate(over="ignore", invalid="ignore"):
+        state, covariance = _minimise(problem, guess)
+    if not np.isfinite(covariance).all():
+        raise DataError("the fit diverges: no motion of the joint explains what the IMU read, is it sick?")
     return _result(state, covariance, problem, _systematic(state, covariance, problem, symmetric_load))
 
 
