@@ -28,6 +28,8 @@ NOISY = (1e-4, 1.5e-3)
 # A sensor at the end of its range reads the same extreme this often in a row, this many of its noise's
 # standard deviations away from its median.
 CLIPPED_SAMPLES, CLIPPED_SIGMAS = 8, 30.0
+# And the swing that it cuts off is larger than this many times its noise or its last digit.
+CUT_OFF = 5.0
 # A joint turns by this much while its encoder or effort is said to be stuck.
 TURNED_RAD = 0.05
 # A position that changes by this much from one sample to the next, and neither before nor after it.
@@ -171,15 +173,31 @@ def _same_for(serial: str, what: str, run: Run, step_s: float, kind: Sickness) -
 
 
 def _clipped(values: Array, noise: float) -> float | None:
-    """Return the extreme at which values (m,) stay, far away from their median; None if they do not."""
-    middle = float(np.median(values))
+    """Return the extreme at which values (m,) are cut off, far away from their median; None if they are not.
+
+    The top of a smooth swing is flat, too, within the step of its digits: it is cut off only where the slopes
+    before and after the flat part say that the swing would have gone well beyond it.
+    """
+    middle, steps = float(np.median(values)), np.abs(np.diff(values))
+    digit = float(steps[steps > 0.0].min(initial=np.inf))
     for extreme in (float(values.max()), float(values.min())):
         at = values == extreme
         if abs(extreme - middle) > CLIPPED_SIGMAS * noise and np.count_nonzero(at) >= CLIPPED_SAMPLES:
-            longest = max((run.length for run in runs(at.astype(float)) if at[run.start]), default=0)
-            if longest >= CLIPPED_SAMPLES:
+            flat = [run for run in runs(at.astype(float), CLIPPED_SAMPLES) if at[run.start]]
+            if any(_cut_off(values, run) > CUT_OFF * max(noise, digit) for run in flat):
                 return extreme
     return None
+
+
+def _cut_off(values: Array, flat: Run) -> float:
+    """Return how much of a swing a flat part of values (m,) has cut off, by the slopes at its ends.
+
+    The top of a parabola is a quarter of its chord times the slope at the chord's ends above it.
+    """
+    reach = max(4, flat.length // 4)
+    before, after = values[max(flat.start - reach, 0) : flat.start + 1], values[flat.end - 1 :][: reach + 1]
+    slopes = [abs(float(one[-1] - one[0])) / (len(one) - 1) for one in (before, after) if len(one) > 1]
+    return float(np.mean(slopes)) * flat.length / 4.0 if slopes else 0.0
 
 
 def _step_s(t_ns: NDArray[np.int64]) -> float:

@@ -174,6 +174,8 @@ class RowLog:
         """Return the rows that have arrived of a span of module time, both ends included, as a copy."""
         index = self._times()
         numbers = index.numbers[_within(index, start_ns, end_ns)]
+        if not len(numbers):
+            return np.zeros(0, ROW)
         found = np.zeros(len(numbers), _RECORD)
         pages, places = np.divmod(numbers, PAGE_ROWS)
         starts = np.flatnonzero(np.diff(pages, prepend=-1))

@@ -65,6 +65,15 @@ def test_a_reading_that_stays_at_the_end_of_its_range_is_saturated() -> None:
     assert _clipped(rows()["gyro_rad_s"][:, 2].astype(float), 6e-4) is None
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_the_top_of_a_slow_swing_in_coarse_steps_is_not_cut_off(seed: int) -> None:
+    # Ten samples in a row may be alike there, 30 standard deviations away from the rest.
+    noise = 3e-4 * np.random.default_rng(seed).standard_normal(2000)
+    swing = np.round((0.12 * np.sin(np.arange(2000) / 90.0) + noise) / STEP) * STEP
+    assert _clipped(swing, 6e-4) is None
+    assert _clipped(np.clip(swing, -0.1, 0.1), 6e-4) is not None
+
+
 def test_a_jump_of_an_encoder_is_named_and_a_hole_in_its_rows_is_not() -> None:
     jumped, with_hole = rows(), np.delete(rows(), slice(700, 800))
     jumped["position_rad"][1000:] += 0.05

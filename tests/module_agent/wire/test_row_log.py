@@ -46,6 +46,14 @@ def test_rows_are_numbered_by_their_times_whatever_is_missing_between() -> None:
     assert log.range_between(0, 1000) == (50, 80)
 
 
+def test_a_span_in_which_no_row_has_arrived_is_empty() -> None:
+    log = RowLog(1)
+    assert len(log.between(0, 10)) == 0
+    log.add(block(5, 3))
+    assert len(log.between(20, 30)) == 0
+    assert log.between(6, 30)["t_ns"].tolist() == [6, 7]
+
+
 def test_forgetting_keeps_what_is_newer() -> None:
     log = RowLog(1)
     log.add(block(0, 100))
