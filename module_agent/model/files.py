@@ -23,7 +23,8 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException as error:
         if temporary.is_file():
             temporary.unlink()
-        if isinstance(error, OSError) and error.filename is None:
+        # A full disk is reported without the file; without a number it is no error of the system.
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 

@@ -109,7 +109,11 @@ def test_residuals_far_beyond_the_noise_are_named_by_serial_and_motion() -> None
     factor = np.full((2, 2, 3), 6.0)
     # The second IMU's gyro in the first motion, and less so its accelerometer; the third's is just not named.
     factor[0, 0, 1], factor[1, 1, 1], factor[1, 0, 2] = 30.0, 20.0, 9.9
-    refined: Any = SimpleNamespace(chain=SimpleNamespace(serials=("A", "B", "C")), residuals=factor * noise)
+    # All axes vary, so that none is stuck.
+    varying = np.ones((2, 2, 2, 3, 3))
+    refined: Any = SimpleNamespace(
+        chain=SimpleNamespace(serials=("A", "B", "C")), residuals=factor * noise, columns=varying
+    )
     (finding,) = misfits(refined, noise, ["the slow motion of A", "the fast motion of A"])
     assert (finding.serial, finding.motion) == ("B", "the slow motion of A")
     assert (finding.measured, finding.expected) == (pytest.approx(6e-3), pytest.approx(2e-4))
