@@ -35,7 +35,7 @@ def test_agents_read_the_limits_of_their_modules_from_the_folder_of_the_run(
     launcher = Launcher(config, lambda line: None)
     started: list[list[str]] = []
 
-    def start(name: str, arguments: list[str], up: str) -> None:
+    def start(name: str, arguments: list[str], up: str, environment: dict[str, str]) -> None:
         started.append(arguments)
 
     monkeypatch.setattr(launcher, "_start", start)
