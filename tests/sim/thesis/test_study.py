@@ -354,7 +354,8 @@ def test_the_command_writes_its_results_and_measures_nothing_twice(
 def test_an_experiment_that_is_not_there_is_refused_with_the_list() -> None:
     done = CliRunner().invoke(app, ["thesis", "--only", "figure99"])
     assert done.exit_code == 2
-    assert "no experiment 'figure99'; there are figure15," in " ".join(str(done.output).split())
+    said = " ".join(str(done.output).split())
+    assert "no experiment 'figure99' (did you mean 'figure59' or 'figure49'?); there are figure15," in said
 
 
 def test_units_in_brackets_reach_the_terminal() -> None:
