@@ -6,6 +6,7 @@ crosses a level u upward nu0 exp(-u^2 / 2 sigma^2) times a second (Rice 1945), w
 rate of false alarms.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,7 @@ class ContactModel(NamedTuple):
         """Return the levels (n,) that all joints together cross `alarms_per_hour` times without contact."""
         share = alarms_per_hour / (3600.0 * len(self.sigma_nm))
         # Up or down; and a level below two sigmas is none.
-        ratio = np.maximum(2.0 * self.crossings_hz / share, np.e**2)
+        ratio = np.maximum(2.0 * self.crossings_hz / share, math.e**2)
         by_noise = self.sigma_nm * np.sqrt(2.0 * np.log(ratio))
         return np.asarray(np.maximum(by_noise, MARGIN * self.largest_nm))
 
