@@ -67,9 +67,10 @@ def test_a_reading_that_stays_at_the_end_of_its_range_is_saturated() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_top_of_a_slow_swing_in_coarse_steps_is_not_cut_off(seed: int) -> None:
-    # Ten samples in a row may be alike there, 30 standard deviations away from the rest.
-    noise = 3e-4 * np.random.default_rng(seed).standard_normal(2000)
-    swing = np.round((0.12 * np.sin(np.arange(2000) / 90.0) + noise) / STEP) * STEP
+    # Its top is in the middle of a step: a dozen samples in a row are alike there, far away from the rest.
+    noise = 1e-4 * np.random.default_rng(seed).standard_normal(2000)
+    swing = np.round((113 * STEP * np.sin(np.arange(2000) / 90.0) + noise) / STEP) * STEP
+    assert max(run.length for run in runs(swing) if swing[run.start] == swing.max()) >= 8
     assert _clipped(swing, 6e-4) is None
     assert _clipped(np.clip(swing, -0.1, 0.1), 6e-4) is not None
 
