@@ -46,6 +46,13 @@ def list_modules(programs, endpoint: str, folder: Path) -> Any:
     return programs.run("coordinator.main", "list", *options)
 
 
+def start_hub(robot, programs) -> Any:
+    """Start a coordinator and wait for its hub, or a `list` that is faster is the hub until it has ended."""
+    coordinator = robot.start_coordinator(quiet=True)
+    programs.until(lambda: "discovering modules" in programs.words(coordinator), "a hub", coordinator)
+    return coordinator
+
+
 def leases(requests: list[Request]) -> list[LeaseRequest]:
     """Return the requests that are of the coordinator; what the intruders ask themselves is garbage."""
     read = []
@@ -105,7 +112,7 @@ def test_with_security_the_robot_identifies_itself_among_intruders(secured, prog
     robot, folder = secured
     serial = robot.config.serials[0]
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
+    coordinator = start_hub(robot, programs)
     robot.start_agents()
     listed = list_modules(programs, endpoint, folder)
     assert listed.returncode == 0, listed.stderr
@@ -148,7 +155,7 @@ def test_anyone_of_the_fleet_stops_the_robot_and_nobody_else(secured, programs, 
     robot, folder = secured
     serial = robot.config.serials[0]
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
+    coordinator = start_hub(robot, programs)
     robot.start_agents()
     observer = folder.parent / "observer"
     observer.mkdir()
