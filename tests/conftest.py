@@ -50,7 +50,13 @@ def robots() -> SimpleNamespace:
 
 
 @pytest.fixture
-def rigs() -> Iterator[Callable[..., Any]]:
+def physics() -> str | None:
+    """The physics engine of the rigs, None for the default; `BOTH_ENGINES` runs tests with each."""
+    return None
+
+
+@pytest.fixture
+def rigs(physics: str | None) -> Iterator[Callable[..., Any]]:
     """Makes rigs and closes them."""
     # Late: what does not simulate needs no physics.
     from tests.rig import Rig
@@ -58,7 +64,7 @@ def rigs() -> Iterator[Callable[..., Any]]:
     made: list[Any] = []
 
     def make(*args: Any, **kwargs: Any) -> Rig:
-        made.append(Rig(*args, **kwargs))
+        made.append(Rig(*args, **{"physics": physics, **kwargs}))
         return made[-1]
 
     yield make

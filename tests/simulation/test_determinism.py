@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -14,17 +14,19 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify
 from coordinator.recording.run_folder import load_recording
 from coordinator.session.run import write_outputs
+from sim.physics.engine import Physics
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.parametrize("physics", get_args(Physics))
 
 
-def _run(out: Path, plan: Plan, seed: int, hash_seed: str) -> str:
+def _run(out: Path, plan: Plan, physics: str, seed: int, hash_seed: str) -> str:
     """Run in a process of its own; return the trace hash that it prints."""
     settings = out.with_suffix(".toml")
     durations = plan.model_dump(exclude_defaults=True, exclude={"dynamics"})
     settings.write_text("".join(f"{name} = {value}\n" for name, value in durations.items()))
     command = [sys.executable, "-m", "sim.main", "run", "thesis_171_horizontal", "--virtual", "--no-dynamics"]
-    command += ["--no-report"]
+    command += ["--no-report", "--physics", physics]
     done = subprocess.run(
         [
             *(*command, "--network", "wifi", "--seed", str(seed)),
@@ -50,11 +52,11 @@ def _without_wall_time(path: Path) -> dict[str, Any]:
 
 @pytest.mark.xdist_group("determinism")
 def test_two_processes_with_one_seed_do_the_same_and_another_seed_does_other(
-    quick_plan: Plan, tmp_path: Path
+    quick_plan: Plan, tmp_path: Path, physics: str
 ) -> None:
-    one = _run(tmp_path / "one", quick_plan, seed=3, hash_seed="1")
-    two = _run(tmp_path / "two", quick_plan, seed=3, hash_seed="2")
-    other = _run(tmp_path / "other", quick_plan, seed=4, hash_seed="1")
+    one = _run(tmp_path / "one", quick_plan, physics, seed=3, hash_seed="1")
+    two = _run(tmp_path / "two", quick_plan, physics, seed=3, hash_seed="2")
+    other = _run(tmp_path / "other", quick_plan, physics, seed=4, hash_seed="1")
     assert one == two != other
     assert _without_wall_time(tmp_path / "one" / "result.json") == _without_wall_time(
         tmp_path / "two" / "result.json"

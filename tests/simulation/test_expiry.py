@@ -2,8 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from module_agent.wire.codec import decode
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, WindowedSine
 from module_agent.wire.refusal import WireError
+from sim.physics.engine import Physics
 
 BASE = "X-00009"
 HORIZONTAL, VERTICAL = "thesis_171_horizontal", "thesis_171_vertical"
@@ -21,10 +21,7 @@ TICK_NS = 1_000_000
 BRISK = WindowedSine(amplitude=0.12, frequency_hz=1.0, centre_s=1.5, sigma_s=1.0)
 
 
-@pytest.fixture(params=["compiled", "pybullet"])
-def rigs(rigs: Callable[..., Any], request: pytest.FixtureRequest) -> Callable[..., Any]:
-    """Makes rigs; every test is run with both engines."""
-    return partial(rigs, physics=request.param)
+pytestmark = pytest.mark.parametrize("physics", get_args(Physics))
 
 
 class Blackbox:

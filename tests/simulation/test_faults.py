@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -17,11 +17,13 @@ from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import NotRecorded, SessionWriter
 from coordinator.session.session import NoModulesFound
 from module_agent.network_emulation.profile import NetworkProfile
+from sim.physics.engine import Physics
 from sim.scoring.score import score
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
 Rigs = Callable[..., Any]
+pytestmark = pytest.mark.parametrize("physics", get_args(Physics))
 
 
 def _right(out: Path) -> None:
