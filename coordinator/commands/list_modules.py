@@ -7,16 +7,19 @@ from rich.table import Table
 from coordinator.commands.options import ConnectOptions, Expect, JsonFile
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import AS_HUB_S, Listing, Search, listed, stop_robot
+from coordinator.monitoring.module_states import full_name
+from coordinator.recording.recording import Recording
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal, figure, new_table, write_result
 from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Transport
+from module_agent.wire.messages import Status
 
 
 @with_options
 def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile = None) -> None:
-    """List the modules on the network: state, holder, acting limits, delay of feedback, refused messages.
+    """List the modules: names, state, holder, acting limits, delay of feedback, refused messages.
 
     Exit codes: 0 all answer, 1 a module does not answer or too few do, 2 wrong usage.
     """
@@ -24,8 +27,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
     transport, search = _open_search(place, at.quiet, expect)
     found = listed(transport, place.robot, search)
     delays = {one.serial: one for one in feedback_delays(found.recording)}
-    known = [(status.model_dump(), delays.get(status.serial)) for status in found.statuses]
-    rows = [each | {"feedback_delay": delay and delay._asdict()} for each, delay in known]
+    rows = [_fields(status, found.recording, delays.get(status.serial)) for status in found.statuses]
     if write_result(json_file, rows):
         Terminal().console.print(_table(place.robot, found, delays))
         if found.cpu_us_per_message is not None:
@@ -35,15 +37,26 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
     _check(place.robot, len(found.statuses), expect, "status", found.silent)
 
 
+def _fields(status: Status, recording: Recording, delay: FeedbackDelay | None) -> dict[str, object]:
+    """Return what is known of a module, for programs; family, name and type as it tells them, or None."""
+    info = recording.modules[status.serial].info
+    told = {name: getattr(info, name, None) for name in ("module_type", "family", "name")}
+    return {**status.model_dump(), **told, "feedback_delay": delay and delay._asdict()}
+
+
 def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> Table:
     """Return the modules with the delay of their feedback from sample to here."""
     table = new_table(
-        robot, "serial | state | holder | >delay p50 [ms] | >p99 [ms] | expiries | limited by | refused"
+        robot,
+        "serial | name | type | state | holder | >delay p50 [ms] | >p99 [ms] | expiries | limited by | "
+        "refused",
     )
     for status in found.statuses:
-        delay = delays.get(status.serial)
+        delay, info = delays.get(status.serial), found.recording.modules[status.serial].info
         table.add_row(
             status.serial,
+            full_name(info) or "-",
+            "-" if info is None else info.module_type,
             status.state,
             status.holder or "-",
             figure(delay and delay.p50_ms, ".1f"),

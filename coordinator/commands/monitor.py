@@ -59,7 +59,8 @@ def monitor_robot(
     """Monitor a robot: all its modules in a live table, or, if it is known, what happens while it moves.
 
     Of a known robot collisions, payloads, friction and wear are reported. Nothing is commanded and no lease
-    is taken, but by the keys of the table: s stops all modules, h holds them where they are, q ends.
+    is taken, but by the keys of the table: s stops all modules, h holds them where they are, l lights the
+    next one's LED, q ends.
     Exit codes: 0 no findings, 4 findings, others as of `run`.
     """
     if baseline is None:
@@ -80,7 +81,7 @@ def monitor_robot(
         raise typer.Exit(EXIT_FINDING)
 
 
-KEYS = "s stop all    h hold, or release    q end"
+KEYS = "s stop all    h hold, or release    l light the next LED    q end"
 
 
 def _show_modules(
@@ -124,7 +125,7 @@ def _show_modules(
         finally:
             messenger.close()
 
-    keys = key_presses(loop, {"s": live.stop, "h": live.hold, "q": end})
+    keys = key_presses(loop, {"s": live.stop, "h": live.hold, "l": live.light, "q": end})
     with screen, keys, contextlib.suppress(asyncio.CancelledError):
         attend(loop, follow())
     if not states.recording.modules and not ended:

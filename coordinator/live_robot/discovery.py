@@ -117,7 +117,7 @@ class Listing(NamedTuple):
 
 
 def listed(transport: Transport, robot: str, search: Search, listen_s: float = LISTEN_S) -> Listing:
-    """Ask all modules for their status, several times while their feedback is heard for `listen_s`.
+    """Ask all modules what they are, and for their status several times while they are heard for `listen_s`.
 
     Closes the transport.
     """
@@ -136,18 +136,24 @@ def listed(transport: Transport, robot: str, search: Search, listen_s: float = L
                 _record(recording, open_tags, t_ns, event)
 
     open_tags: set[int] = set()
+
+    def ask(serial: str, leaf: Leaf, tag: int) -> None:
+        topic, payload = key(robot, serial, leaf), encode(_ask(serial, tag))
+        open_tags.add(tag)
+        recording.accept(Entry("request", topic, time.monotonic_ns(), payload))
+        transport.query(topic, payload, ANSWER_S, sink, tag)
+
     try:
         serials = _present(transport, robot, search)
         begun_s, cpu_s = time.monotonic(), time.process_time()
         transport.subscribe(every(robot, Leaf.FEEDBACK), sink)
         for number in range(TRIPS):
             for place, serial in enumerate(serials):
-                tag = number * len(serials) + place + 1
-                topic, payload = key(robot, serial, Leaf.STATUS), encode(_ask(serial, tag))
-                open_tags.add(tag)
-                recording.accept(Entry("request", topic, time.monotonic_ns(), payload))
-                transport.query(topic, payload, ANSWER_S, sink, tag)
+                ask(serial, Leaf.STATUS, number * len(serials) + place + 1)
             take_until(begun_s + listen_s * (number + 1) / TRIPS)
+        # Afterwards: a longer answer would be in the delays.
+        for place, serial in enumerate(serials):
+            ask(serial, Leaf.INFO, TRIPS * len(serials) + place + 1)
         take_until(time.monotonic() + ANSWER_S + 5.0, lambda: not open_tags)
         cpu_s = time.process_time() - cpu_s
     finally:

@@ -1,4 +1,4 @@
-"""Follow all modules of a robot on its network: hear them, ask them, and stop or hold them when told to."""
+"""Follow all modules of a robot on its network: hear them, ask them, stop, hold and light them."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Sequence
@@ -9,7 +9,7 @@ from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from module_agent.model.errors import RobotError
 from module_agent.wire.keys import Leaf
-from module_agent.wire.messages import Ask, Stop
+from module_agent.wire.messages import Ask, Identify, Stop
 
 # Period of the updates, and of the requests to every module, which are round trips for its clock as well.
 UPDATE_S, ASK_S = 0.25, 0.5
@@ -39,6 +39,7 @@ class LiveStates:
         self._described: set[tuple[str, int]] = set()
         self._group: ModuleGroup | None = None
         self._keeper: asyncio.Task[None] | None = None
+        self._lit: str | None = None
         self._work: set[asyncio.Task[None]] = set()
 
     @property
@@ -60,6 +61,7 @@ class LiveStates:
             asking.cancel()
             await asyncio.gather(asking, *self._work, return_exceptions=True)
             await self._release()
+            await self._give_back_led()
 
     def stop(self) -> None:
         """Stop every module at once; what was held is held no longer."""
@@ -68,6 +70,10 @@ class LiveStates:
     def hold(self) -> None:
         """Take the leases, so that every module holds its position; the second time, release them."""
         self._do(self._release() if self.holds else self._hold())
+
+    def light(self) -> None:
+        """Light the LED of the next module by serial, so that it is found; after the last one none is lit."""
+        self._do(self._light_next())
 
     def _do(self, work: Coroutine[None, None, None]) -> None:
         async def attempt() -> None:
@@ -111,6 +117,28 @@ class LiveStates:
         self._keeper = asyncio.create_task(group.keep_alive())
         self._keeper.add_done_callback(self._kept)
         self._note(f"held: {', '.join(group.serials)}")
+
+    async def _light_next(self) -> None:
+        before = self._lit
+        later = [serial for serial in sorted(self._messenger.alive) if before is None or serial > before]
+        await self._give_back_led()
+        if not later:
+            self._note("no LED is lit")
+            return
+        self._lit = later[0]
+        await self._set_led(later[0], on=True)
+        self._note(f"the LED of {later[0]} is lit")
+
+    async def _give_back_led(self) -> None:
+        lit, self._lit = self._lit, None
+        # One that left keeps its LED by itself at most until it boots.
+        with suppress(RobotError):
+            if lit is not None and lit in self._messenger.alive:
+                await self._set_led(lit, on=False)
+
+    async def _set_led(self, serial: str, on: bool) -> None:
+        head = {"serial": serial, "boot": 0, "seq": self._messenger.next_seq(), "sender": self._sender.name}
+        await self._messenger.command(serial, Leaf.IDENTIFY, Identify.model_validate({**head, "on": on}))
 
     def _kept(self, keeper: "asyncio.Task[None]") -> None:
         """Say why holding ended, if it was not asked to."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from coordinator.recording.recording import Entry, ModuleRecord, Recording, RoundTrip
 from module_agent.model.chain import Array
-from module_agent.wire.messages import Feedback, Message
+from module_agent.wire.messages import Feedback, Info, Message
 
 WINDOW_NS = 10_000_000_000
 # What a session of days keeps of a module: ten seconds of rows at 1 kHz, and a minute of round trips.
@@ -26,11 +26,13 @@ SILENT_NS = 1_000_000_000
 class ModuleState(NamedTuple):
     """A module at one time; None where it is not known.
 
-    state: as the module says, or `silent`, or `gone` without its liveliness token. rows_per_s, delay_p50_ms,
-    delay_p99_ms: of the last ten seconds. lost_rows: since the module was heard first. refused: by reason.
+    name: family and name as its user gave them, empty without. state: as the module says, or `silent`, or
+    `gone` without its liveliness token. rows_per_s, delay_p50_ms, delay_p99_ms: of the last ten seconds.
+    lost_rows: since the module was heard first. refused: by reason.
     """
 
     serial: str
+    name: str
     kind: str | None
     state: str
     holder: str | None
@@ -44,6 +46,11 @@ class ModuleState(NamedTuple):
     delay_p50_ms: float | None = None
     delay_p99_ms: float | None = None
     refused: Mapping[str, int] = MappingProxyType({})
+
+
+def full_name(info: Info | None) -> str:
+    """Return `family/name` as HEBI's programs write it, or what there is of it."""
+    return "" if info is None else "/".join(part for part in (info.family, info.name) if part)
 
 
 class _Delivery(NamedTuple):
@@ -119,12 +126,13 @@ class ModuleStates:
     def _state(self, serial: str, now_ns: int, present: bool) -> ModuleState:
         module = self.recording.modules.get(serial)
         if module is None:
-            return ModuleState(serial, None, "silent", None)
+            return ModuleState(serial, "", None, "silent", None)
         status, info, known = module.status, module.info, self._deliveries.get(serial)
         silent = module.feedback_ns is None or now_ns - module.feedback_ns > SILENT_NS
         own = status.state if status is not None else "unknown"
         state = ModuleState(
             serial,
+            full_name(info),
             info.module_type if info is not None else None,
             "gone" if not present else "silent" if silent else own,
             status.holder if status is not None else None,

@@ -86,7 +86,7 @@ def ask(serial: str = "A", seq: int = 1) -> Ask:
     return Ask(serial=serial, boot=0, seq=seq, sender="tester")
 
 
-def info(serial: str = "A", boot: int = 1, kind: str = "X5-4", t_ns: int = 0) -> Info:
+def info(serial: str = "A", boot: int = 1, kind: str = "X5-4", t_ns: int = 0, **more: Any) -> Info:
     found = module_type(kind)
     return Info(
         serial=serial,
@@ -104,6 +104,7 @@ def info(serial: str = "A", boot: int = 1, kind: str = "X5-4", t_ns: int = 0) ->
         limits=catalogue_limits(found),
         gains=default_gains(found, 3),
         t_ns=t_ns,
+        **more,
     )
 
 

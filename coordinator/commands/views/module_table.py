@@ -16,8 +16,8 @@ _NOTES = 3
 # Seconds between lines in a pipe, and lines of JSON.
 LINE_S = 1.0
 _COLUMNS = (
-    "module | type | state | holder | >position [deg] | >speed [deg/s] | >effort [Nm] | >winding [°C] | "
-    ">[V] | >rows/s | >lost | >delay p50 [ms] | >p99 | refused"
+    "module | name | type | state | holder | >position [deg] | >speed [deg/s] | >effort [Nm] | "
+    ">winding [°C] | >[V] | >rows/s | >lost | >delay p50 [ms] | >p99 | refused"
 )
 _STYLES = {
     "idle": "dim",
@@ -98,6 +98,7 @@ def table(robot: str, states: Sequence[ModuleState]) -> Table:
     for state in states:
         shown.add_row(
             state.serial,
+            state.name or "-",
             state.kind or "-",
             Text(state.state, style=_STYLES.get(state.state, "")),
             _short(state.holder),

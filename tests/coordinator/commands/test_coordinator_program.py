@@ -17,6 +17,7 @@ from coordinator.live_robot.discovery import Search, listed, stop_robot
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.live_robot.messenger import NoAnswer
 from coordinator.main import app
+from coordinator.monitoring.module_states import full_name
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry
 from coordinator.recording.run_folder import SESSION, RunFolderError, check_free, open_run_folder
@@ -281,6 +282,8 @@ class Robot:
             asked = decode(Ask, payload)
             assert asked.serial == serial
             return encode(self.wire.status(serial, re=asked.seq))
+        if at.endswith("info"):
+            return encode(self.wire.info(serial, family="Arm", name=f"{serial}-joint"))
         self.stopped.append(decode(Stop, payload).serial)
         return encode(self.wire.ack(serial=serial))
 
@@ -298,6 +301,13 @@ def test_every_module_is_listed_and_who_does_not_answer_is_named(wire: Any) -> N
     assert all(isinstance(status, Status) for status in statuses)
     assert deaf == ["C"]
     assert robot.closed
+
+
+def test_modules_are_listed_with_the_names_that_their_user_gave(wire: Any) -> None:
+    robot: Any = Robot(wire, ("A", "B"), deaf=("B",))
+    known = listed(robot, "arm", QUICK, listen_s=0.1).recording.modules
+    assert full_name(known["A"].info) == "Arm/A-joint"
+    assert full_name(known["B"].info) == ""
 
 
 def test_the_delay_of_feedback_is_heard_meanwhile(wire: Any) -> None:

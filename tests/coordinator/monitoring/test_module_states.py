@@ -203,6 +203,24 @@ def test_a_key_stops_all_modules_also_those_that_another_program_holds(follower:
     assert follower.notes == ["stopped: X-00009, X-00010"]
 
 
+def test_a_key_lights_one_led_after_the_other_and_the_end_of_the_table_the_last(follower: Follower) -> None:
+    lit: list[list[str]] = []
+    modules = [host.modules[0].firmware.config.serial for host in follower.rig.hosts.values()]
+
+    def look() -> None:
+        drives = (host._hardware.identified for host in follower.rig.hosts.values())
+        lit.append([serial for serials in drives for serial in serials])
+
+    for k in range(4):
+        follower.rig.at(1.0 + k, follower.live.light)
+        follower.rig.at(1.5 + k, look)
+    follower.follow(5.0)
+    look()
+    assert lit == [["X-00009"], ["X-00010"], [], ["X-00009"], []]
+    assert follower.notes[1:3] == ["the LED of X-00010 is lit", "no LED is lit"]
+    assert [follower.rig.state(serial) for serial in modules] == ["idle", "idle"]
+
+
 def test_who_holds_a_module_is_named_where_it_cannot_be_held(follower: Follower) -> None:
     _, _, group = follower.rig.group("another")
 
@@ -224,9 +242,22 @@ def test_who_holds_a_module_is_named_where_it_cannot_be_held(follower: Follower)
 
 def example() -> list[ModuleState]:
     moving = ModuleState(
-        "elbow", "X5-4", "moving", "me-7@host-1f", 0.5, -0.1, 1.25, 31.0, 23.9, 250.0, 12, 1.5, 4.0
+        "elbow",
+        "Arm/lift",
+        "X5-4",
+        "moving",
+        "me-7@host-1f",
+        0.5,
+        -0.1,
+        1.25,
+        31.0,
+        23.9,
+        250.0,
+        12,
+        1.5,
+        4.0,
     )
-    return [moving, ModuleState("wrist", None, "silent", None, refused={"no_lease": 3})]
+    return [moving, ModuleState("wrist", "", None, "silent", None, refused={"no_lease": 3})]
 
 
 def test_the_table_has_every_figure_with_its_unit() -> None:
@@ -240,6 +271,7 @@ def test_the_table_has_every_figure_with_its_unit() -> None:
         "1.25",
         "31.0",
         "23.9",
+        "Arm/lift",
         "me-7",
         "no_lease 3",
         "[deg]",
