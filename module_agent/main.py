@@ -176,7 +176,7 @@ def main(
     if hebi and list_modules:
         _list(library)
         return
-    options = HebiOptions(family, tuple(name or ()), tuple(module_type or ()), rate, library)
+    options = HebiOptions(family, tuple(name or ()), tuple(module_type or ()), rate, safety, library)
     settings = {
         "feedback_rate_hz": feedback_rate,
         "lifetime_ns": round(lifetime_ms * 1e6),
@@ -197,11 +197,7 @@ def main(
         _check_expiry(expiry, hebi)
         if not hebi and not (serial and bus):
             raise UsageError("give --serial and --bus for simulated modules, or --hebi for real ones")
-        if hebi and safety:
-            raise UsageError(
-                "--safety with --hebi: set the safety parameters of real modules in HEBI's own tools"
-            )
-        limits = read_safety(safety, serial or []) if safety else {}
+        limits = read_safety(safety, serial or []) if safety and not hebi else {}
     _run(robot, options if hebi else _OnBus(bus, tuple(serial or ()), limits), open_transport, settings)
 
 

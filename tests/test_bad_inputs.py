@@ -50,6 +50,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "run --out NEW --secure BAD",
         "list --secure BAD",
         "stop --network BAD",
+        "safety BAD A",
+        "safety BAD A --out NEW",
+        "export BAD --to csv --out NEW",
+        "view BAD",
     ),
     "x5-sim": (
         "run BAD --virtual --out NEW",

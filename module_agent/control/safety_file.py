@@ -47,8 +47,8 @@ _M_STOPS: dict[str, MStopAction] = {
 }
 # How the manufacturer writes the words.
 _WRITTEN = {"disabled": "disabled", "motor_off": "motor_off", "hold": "motor_hold", "spring": "spring"}
-# What XML can say of a module.
-_XML_FIELDS = {"position_rad", "at_limit", "velocity_rad_s", "effort_nm", "m_stop"}
+# What XML can say of a module, and what HEBI's modules have.
+XML_FIELDS = {"position_rad", "at_limit", "velocity_rad_s", "effort_nm", "m_stop"}
 
 
 class SafetyFileError(UsageError):
@@ -276,7 +276,7 @@ def safety_xml(safety: Sequence[Safety]) -> str:
         UsageError: a configuration has what the format does not.
     """
     for number, one in enumerate(safety, start=1):
-        only = {key for key, value in one if value != getattr(UNCONFIGURED, key)} - _XML_FIELDS
+        only = {key for key, value in one if value != getattr(UNCONFIGURED, key)} - XML_FIELDS
         if only:
             raise UsageError(f"module {number}: safety parameters in XML have no {', '.join(sorted(only))}")
     root = Element("group_safety", version="1.0.0")

@@ -1,14 +1,17 @@
-"""HEBI modules on the network: finding them, and what they tell of themselves."""
+"""HEBI modules on the network: finding them, what they tell of themselves, and setting their limits."""
 
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
 from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.control.safety import UNCONFIGURED, LimitAction, MStopAction, Safety
+from module_agent.control.safety_file import XML_FIELDS, read_safety
 from module_agent.hardware.hardware import HardwareLost, ModuleInformation
 from module_agent.hardware.hebi_library import HEBI, Group, Library, library, names_of
 from module_agent.hardware.hebi_modules import HebiModules
@@ -21,20 +24,24 @@ from module_agent.wire.messages import GainSet, Limits, PidGains
 LOOKUP_S = 2.0
 MIN_RATE_HZ, MAX_RATE_HZ = 50.0, 1000.0
 _TIMEOUT_MS = 1000
-_LIMIT_DISABLED = 3
 _MAX_GAIN = 1e6
+# HEBI's values of what happens at a limit of position, and while the emergency stop is pressed.
+AT_LIMIT: dict[LimitAction, int] = {"hold": 0, "spring": 1, "motor_off": 2, "disabled": 3}
+AT_M_STOP: dict[MStopAction, int] = {"disabled": 0, "motor_off": 1, "hold": 2}
 
 
 class HebiOptions(NamedTuple):
     """Which modules to drive and how: those of a family by their names, or all of them without.
 
-    types: of the modules in their order, if they are not to be asked. `library` stands in for hebi-py.
+    types: of the modules in their order, if they are not to be asked. safety: the file of their limits.
+    `library` stands in for hebi-py.
     """
 
     family: str
     names: tuple[str, ...] = ()
     types: tuple[str, ...] = ()
     rate_hz: float = 250.0
+    safety: Path | None = None
     library: str = HEBI
 
 
@@ -42,12 +49,15 @@ def open_modules(options: HebiOptions) -> HebiModules:
     """Find modules on the network and return their driver, in real time.
 
     Raises:
-        UsageError: hebi-py or a module is missing, or an option cannot be.
-        HardwareLost: a module does not answer.
+        UsageError: hebi-py or a module is missing, or an option or a limit cannot be.
+        HardwareLost: a module does not answer, or does not take its limits.
     """
     hebi = library(options.library)
     group = find_group(hebi, options.family, options.names)
     information = describe(hebi, group, options.rate_hz, options.types)
+    if options.safety is not None:
+        limits = read_safety(options.safety, [module.serial for module in information])
+        information = restrict(hebi, group, information, list(limits.values()))
     return HebiModules(hebi, group, information, Pace(options.rate_hz).wait)
 
 
@@ -160,6 +170,69 @@ def _described(info: Any, index: int, rate_hz: float, types: Sequence[str]) -> M
     return ModuleInformation(serial, name, family, kind.name, gains, limits, tick_ns, tick_ns)
 
 
+def restrict(
+    hebi: Library, group: Group, information: Sequence[ModuleInformation], safety: Sequence[Safety]
+) -> list[ModuleInformation]:
+    """Set the limits of modules until their next power cycle; return what the modules are now.
+
+    A limit that a module has and that is narrower than the configured one stays.
+
+    Args:
+        hebi: hebi-py.
+        group: the modules.
+        information: what they tell, in their order.
+        safety: their limits, in their order.
+
+    Raises:
+        UsageError: a limit that HEBI's modules do not have, or one that leaves no position.
+        HardwareLost: a module does not take its limits.
+    """
+    for module, one in zip(information, safety, strict=True):
+        others = [key for key, value in one if key not in XML_FIELDS and value != getattr(UNCONFIGURED, key)]
+        if others:
+            raise UsageError(f"module {module.serial}: a real module has no limit {', '.join(others)}")
+    limits = [one.tightened(module.limits) for module, one in zip(information, safety, strict=True)]
+    command = hebi.GroupCommand(group.size)
+    written = [dict(_settings(one, own)) for one, own in zip(safety, limits, strict=True)]
+    for index, settings in enumerate(written):
+        for name, value in settings.items():
+            setattr(command[index], name, value)
+    group.send_command_with_acknowledgement(command, timeout_ms=_TIMEOUT_MS)
+    info = _info(group)
+    for index, (module, settings) in enumerate(zip(information, written, strict=True)):
+        for name, value in settings.items():
+            # Speeds and torques are of single precision.
+            if not math.isclose(told := float(getattr(info, name)[index]), value, rel_tol=1e-6):
+                raise HardwareLost(f"module {module.serial} does not take {name} {value:g}, it has {told:g}")
+    return [
+        module._replace(limits=own, safety=one)
+        for module, one, own in zip(information, safety, limits, strict=True)
+    ]
+
+
+def _settings(safety: Safety, limits: Limits) -> Iterator[tuple[str, float]]:
+    """Yield HEBI's names and values of the limits of a module that are narrower than its own.
+
+    limits: the module's, tightened by `safety`.
+    """
+    own = limits.min_position_rad, limits.max_position_rad
+    for side, limit, action, tight in zip(
+        ("min", "max"), safety.range_rad, safety.at_limit, own, strict=True
+    ):
+        if limit == tight:
+            yield f"position_limit_{side}", limit
+            yield f"{side}_position_limit_strategy", AT_LIMIT[action]
+    for name, both, most in (
+        ("velocity", safety.velocity_rad_s, limits.max_speed_rad_s),
+        ("effort", safety.effort_nm, limits.max_effort_nm),
+    ):
+        for side, limit in zip(("min", "max"), both, strict=True):
+            if math.isfinite(limit):
+                yield f"{name}_limit_{side}", math.copysign(min(abs(limit), most), limit)
+    if safety.m_stop is not None:
+        yield "mstop_strategy", AT_M_STOP[safety.m_stop]
+
+
 def _type_name(told: str, serial: str) -> str:
     """Return the catalogue's name of what a module says that it is, such as "X5-4" or "Actuator X5-4 B"."""
     # "X5-9-old" is no X5-9.
@@ -177,10 +250,11 @@ def _limits(info: Any, index: int, kind: ModuleType) -> Limits:
     limits = catalogue_limits(kind)
     low, high = float(info.position_limit_min[index]), float(info.position_limit_max[index])
     position = {}
-    if low < high:
-        if info.min_position_limit_strategy[index] != _LIMIT_DISABLED and math.isfinite(low):
+    # One that a module does not tell is NaN.
+    if not low >= high:
+        if info.min_position_limit_strategy[index] != AT_LIMIT["disabled"] and math.isfinite(low):
             position["min_position_rad"] = low
-        if info.max_position_limit_strategy[index] != _LIMIT_DISABLED and math.isfinite(high):
+        if info.max_position_limit_strategy[index] != AT_LIMIT["disabled"] and math.isfinite(high):
             position["max_position_rad"] = high
     most = {}
     for field, name in (("max_speed_rad_s", "velocity"), ("max_effort_nm", "effort")):

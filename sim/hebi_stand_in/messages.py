@@ -11,11 +11,19 @@ LOOPS = ("position", "velocity", "effort")
 _GAINS = [f"{loop}_{name}" for loop in LOOPS for name in PidGains.model_fields if name != "d_on_error"]
 _ON_ERROR = [f"{loop}_d_on_error" for loop in LOOPS]
 
+_LIMITS = {
+    **dict.fromkeys(["position_limit_min", "position_limit_max"], np.float64),
+    **dict.fromkeys([f"{name}_limit_{side}" for name in LOOPS[1:] for side in ("min", "max")], np.float32),
+    **dict.fromkeys(
+        ["min_position_limit_strategy", "max_position_limit_strategy", "mstop_strategy"], np.int32
+    ),
+}
 COMMAND = {
     "position": np.float64,
     **dict.fromkeys(["velocity", "effort", *_GAINS], np.float32),
     **dict.fromkeys([*_ON_ERROR, "accel_includes_gravity"], np.bool_),
     "control_strategy": np.int32,
+    **_LIMITS,
 }
 FEEDBACK = {
     "position": np.float64,
@@ -37,13 +45,10 @@ FEEDBACK = {
 }
 VECTORS = ("gyro", "accelerometer")
 INFO = {
-    **dict.fromkeys([*_GAINS, "velocity_limit_min", "velocity_limit_max"], np.float32),
-    **dict.fromkeys(["effort_limit_min", "effort_limit_max"], np.float32),
-    **dict.fromkeys(["position_limit_min", "position_limit_max"], np.float64),
+    **dict.fromkeys(_GAINS, np.float32),
     **dict.fromkeys([*_ON_ERROR, "accel_includes_gravity"], np.bool_),
-    **dict.fromkeys(
-        ["control_strategy", "min_position_limit_strategy", "max_position_limit_strategy"], np.int32
-    ),
+    "control_strategy": np.int32,
+    **_LIMITS,
 }
 TEXTS = ("name", "family", "serial", "mechanical_type", "firmware_revision")
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from module_agent.control.controller import MOTOR_OFF, NOMINAL_VOLTAGE_V, Command
 from module_agent.control.gains import default_gains
+from module_agent.control.safety import UNCONFIGURED, Safety
 from module_agent.hardware.hardware import (
     LimitState,
     ModuleSample,
@@ -14,16 +15,22 @@ from module_agent.hardware.hardware import (
     WiredModule,
 )
 from module_agent.hardware.hebi_modules import FIELDS
+from module_agent.hardware.hebi_network import AT_LIMIT, AT_M_STOP
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import AMBIENT_C, GRAVITY_M_S2, module_type
 from module_agent.wire.messages import GainSet, PidGains
 from sim.hebi_stand_in.messages import LOOPS, Color, GroupCommand, GroupFeedback, GroupInfo
 
 FAMILY = "simulated"
+_LIMITS = {"position": "position_rad", "velocity": "velocity_rad_s", "effort": "effort_nm"}
+_SAFETY = [
+    *(f"{name}_limit_{side}" for name in _LIMITS for side in ("min", "max")),
+    *("min_position_limit_strategy", "max_position_limit_strategy", "mstop_strategy"),
+]
 UNLOCKED, LOCKED_BY_OTHER, LOCKED_BY_SENDER = 0, 1, 2
 _INSIDE, _AT_UPPER = 2, 3
-_LIMIT_DISABLED = 3
-_NO_LIMIT_TOLD = math.nan
+_AT_LIMIT = {value: action for action, value in AT_LIMIT.items()}
+_AT_M_STOP = {value: action for action, value in AT_M_STOP.items()}
 # Readings before the first tick: at rest, with z up.
 _NOTHING = SensorSample(0, 0, 0, 0, 0, 0, 0, 0, AMBIENT_C, 24.0, 0, 0, 0, 0, 0, GRAVITY_M_S2)
 
@@ -50,6 +57,7 @@ class NetworkModule:
 
     def __init__(self, module: WiredModule):
         self._wires = _Wires(module)
+        self._safety = UNCONFIGURED.model_copy(update={"m_stop": "motor_off"})
         self._loops = LoopInside(self._wires)
         self._kind = module_type(module.module_type)
         self.serial = self.name = module.serial
@@ -60,6 +68,7 @@ class NetworkModule:
         self.led: Color | None = None
         self.sample = self._loops.take(0, _NOTHING)
         self._targets: Command | None = None
+        self._held: Command | None = None
         self._sender: object = None
         self._until_ns: float = 0
 
@@ -72,11 +81,15 @@ class NetworkModule:
         """Run the loops on what is read; return the PWM."""
         self._wires.reading = reading
         (self.sample,) = self._loops.receive()
-        if self.m_stop:
+        if self.m_stop and self._safety.m_stop == "motor_off":
             # HEBI's MotorOff: strategy 0 until the user sets another one.
             if self.gains.strategy:
                 self._loops.set_gains(0, default_gains(self._kind, 0))
             self._targets = MOTOR_OFF
+        elif self.m_stop and self._safety.m_stop == "hold":
+            self._targets = self._held = self._held or Command(reading.position_rad, math.nan, math.nan)
+        else:
+            self._held = None
         if self.sample.sensors.t_ns > self._until_ns and self._sender is not None:
             self._sender, self._targets = None, MOTOR_OFF
         if self._targets is not None:
@@ -107,10 +120,30 @@ class NetworkModule:
                 own[loop] |= {name: getattr(command, f"{loop}_{name}")[index].item() for name in names}
             own["strategy"] = int(command.control_strategy[index])
             self._loops.set_gains(0, GainSet.model_validate(own))
+        if safety := {name: getattr(command, name)[index].item() for name in _SAFETY if name in written}:
+            self._restrict(safety)
         if "accel_includes_gravity" in command.written:
             self.accel_includes_gravity = bool(command.accel_includes_gravity[index])
         if (color := command.leds[index].color) is not None:
             self.led = color if color.a else None
+
+    def _restrict(self, written: dict[str, Any]) -> None:
+        """Take limits by HEBI's names."""
+        own = self._safety.model_dump()
+        for place, side in enumerate(("min", "max")):
+            for name, ours in _LIMITS.items():
+                if (limit := written.get(f"{name}_limit_{side}")) is not None:
+                    own[ours] = [limit if k == place else value for k, value in enumerate(own[ours])]
+            if (action := written.get(f"{side}_position_limit_strategy")) is not None:
+                own["at_limit"] = [
+                    _AT_LIMIT[action] if k == place else v for k, v in enumerate(own["at_limit"])
+                ]
+        if (action := written.get("mstop_strategy")) is not None:
+            own["m_stop"] = _AT_M_STOP[action]
+        gains, self._safety = self.gains, Safety.model_validate(own)
+        self._loops = LoopInside(self._wires, {self.serial: self._safety})
+        self._loops.set_gains(0, gains)
+        self.sample = self._loops.take(0, self.sample.sensors)
 
     def write_feedback(self, sender: object, feedback: GroupFeedback, index: int) -> None:
         """Write this module's part of a feedback for a sender."""
@@ -147,10 +180,17 @@ class NetworkModule:
             own: PidGains = getattr(self.gains, loop)
             for name in PidGains.model_fields:
                 getattr(info, f"{loop}_{name}")[index] = getattr(own, name)
-        limits = self._loops.information[0].limits
-        for side, value in (("min", limits.min_position_rad), ("max", limits.max_position_rad)):
-            getattr(info, f"position_limit_{side}")[index] = _NO_LIMIT_TOLD if value is None else value
-            getattr(info, f"{side}_position_limit_strategy")[index] = _LIMIT_DISABLED if value is None else 0
+        safety, limits = self._safety, self._loops.information[0].limits
+        told = limits.min_position_rad, limits.max_position_rad
+        for side, value, action in zip(("min", "max"), told, safety.at_limit, strict=True):
+            getattr(info, f"position_limit_{side}")[index] = math.nan if value is None else value
+            action = "disabled" if value is None else action
+            getattr(info, f"{side}_position_limit_strategy")[index] = AT_LIMIT[action]
+        for name, ours in _LIMITS.items():
+            for side, value in zip(("min", "max"), getattr(safety, ours), strict=True):
+                if name != "position" and math.isfinite(value):
+                    getattr(info, f"{name}_limit_{side}")[index] = value
+        info.mstop_strategy[index] = AT_M_STOP[safety.m_stop or "motor_off"]
 
 
 class ModuleNetwork:

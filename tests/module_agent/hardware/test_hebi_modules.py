@@ -10,6 +10,7 @@ import pytest
 
 from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
 from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.control.safety import Safety
 from module_agent.hardware import hebi_library, hebi_network
 from module_agent.hardware.hardware import (
     HardwareLost,
@@ -253,6 +254,64 @@ def test_what_cannot_be_driven_is_refused_with_what_is_possible(
         hebi_network.describe(bench.library, bench.group, **{"rate_hz": 250.0} | change)
 
 
+LIMITED = Safety(position_rad=(-0.5, 0.3), velocity_rad_s=(-1.0, 0.4), effort_nm=(-2.0, 1.5), m_stop="hold")
+
+
+def restrict(bench: Bench, safety: Safety) -> ModuleInformation:
+    """Give the last module limits, and the other one none, by the driver; return what it is then."""
+    information = hebi_network.describe(bench.library, bench.group, 250.0)
+    both = hebi_network.restrict(bench.library, bench.group, information, [Safety(), safety])
+    assert both[0] == information[0]
+    return both[LAST]
+
+
+def test_limits_of_a_file_are_enforced_by_the_module_itself(bench: Bench) -> None:
+    limits = restrict(bench, LIMITED).limits
+    assert (limits.min_position_rad, limits.max_position_rad) == (-0.5, 0.3)
+    assert (limits.max_speed_rad_s, limits.max_effort_nm) == (0.4, 1.5)
+    told = hebi_network.describe(bench.library, bench.group, 250.0)[LAST].limits
+    assert told.max_position_rad == 0.3
+    speeds, positions = [], []
+    for _ in range(500):
+        bench.tick(FORWARD)
+        sensors = bench.module.sample.sensors
+        speeds.append(sensors.velocity_rad_s)
+        positions.append(sensors.position_rad)
+    # Ten rad away is where it is sent to. The speed's loop overshoots by less than a quarter.
+    assert max(speeds) < 1.25 * 0.4
+    assert 0.2 < max(positions) < 0.3
+
+
+def test_a_narrower_limit_of_the_module_stays(bench: Bench) -> None:
+    restrict(bench, LIMITED)
+    wider = restrict(bench, Safety(position_rad=(-1.0, 0.2), velocity_rad_s=(-5.0, 5.0)))
+    assert (wider.limits.min_position_rad, wider.limits.max_position_rad) == (-0.5, 0.2)
+    assert wider.limits.max_speed_rad_s == pytest.approx(0.4)
+
+
+def test_at_the_m_stop_the_module_does_what_its_file_says(bench: Bench) -> None:
+    restrict(bench, LIMITED)
+    bench.ticks(100, Command(0.1, NAN, NAN))
+    bench.module.m_stop = True
+    samples = bench.ticks(100, Command(-0.1, NAN, NAN))
+    assert samples[-1].m_stop
+    moved = [sample.sensors.position_rad - samples[0].sensors.position_rad for sample in samples]
+    assert np.max(np.abs(moved)) < 0.01
+
+
+def test_a_limit_that_real_modules_do_not_have_is_refused(bench: Bench) -> None:
+    with pytest.raises(UsageError, match="X-00010: a real module has no limit current_a, winding_c"):
+        restrict(bench, Safety(current_a=1.0, winding_c=80.0))
+
+
+def test_a_module_that_does_not_take_its_limits_is_named(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench.module, "_restrict", lambda written: None)
+    with pytest.raises(HardwareLost, match=r"X-00010 does not take position_limit_min -0\.5, it has nan"):
+        restrict(bench, LIMITED)
+
+
 def test_modules_are_found_by_family_and_name_and_what_is_missing_is_named(bench: Bench) -> None:
     waited: list[float] = []
     group = hebi_network.find_group(bench.library, FAMILY, ["X-00010"], waited.append)
@@ -307,6 +366,20 @@ def test_without_hebi_py_the_error_says_how_to_install_it(monkeypatch: pytest.Mo
     monkeypatch.setitem(__import__("sys").modules, "hebi", None)
     with pytest.raises(UsageError, match=r"pip install --no-deps hebi-py==2"):
         hebi_library.library()
+
+
+def test_actions_at_limits_have_hebi_pys_numbers() -> None:
+    numbers = hebi().GroupCommand(1)
+    names = {
+        "hold": "HoldPosition",
+        "spring": "DampedSpring",
+        "motor_off": "MotorOff",
+        "disabled": "Disabled",
+    }
+    for action, number in hebi_network.AT_LIMIT.items():
+        assert numbers._enum_max_position_limit_strategy_str_mappings[names[action]] == number
+    for action, number in hebi_network.AT_M_STOP.items():
+        assert numbers._enum_mstop_strategy_str_mappings[names[action]] == number
 
 
 def test_the_stand_in_has_no_field_and_no_method_that_hebi_py_has_not() -> None:
