@@ -1,6 +1,8 @@
 """Terminal output: tables, and a progress line with notes above it; plain lines in a pipe."""
 
 import json
+import os
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +21,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from module_agent.model.errors import UsageError
+from module_agent.model.errors import EXIT_FAILED, UsageError
 from module_agent.model.files import json_text, write_json
 
 _MIN_PIPE_WIDTH = 150
@@ -118,11 +120,28 @@ class Displayed:
         self.console.print(f"  {text}", markup=False, soft_wrap=True)
 
 
+class _StandardError(Console):
+    """Standard error; that nothing reads it any more (`2>&1 | head`) is taken as a closed terminal."""
+
+    def on_broken_pipe(self) -> None:
+        """End the program as by SIGHUP: what it moves is stopped first, and its recording is kept.
+
+        Raises:
+            SystemExit: it does not handle the signal, since it has nothing to stop.
+        """
+        self.quiet = True
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stderr.fileno())
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+            raise SystemExit(EXIT_FAILED)
+        signal.raise_signal(signal.SIGHUP)
+
+
 class Terminal(Displayed):
     """Progress and notes on standard error, so that standard output stays for results."""
 
     def __init__(self, quiet: bool = False):
-        console = Console(stderr=True, highlight=False, quiet=quiet)
+        console = _StandardError(stderr=True, highlight=False, quiet=quiet)
         self._progress = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=30),

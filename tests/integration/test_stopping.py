@@ -76,3 +76,22 @@ def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
     journal = load_recording(config.out / "session.mcap").journal
     assert journal[-1].what == "failed"
     assert [event for event in journal if "stop" in event.text and event.what == "note"] == []
+
+
+def test_a_run_whose_output_nothing_reads_any_more_ends_as_with_a_closed_terminal(programs, tmp_path) -> None:
+    """As by `x5-sim run ... 2>&1 | head -1`."""
+    command = [sys.executable, "-m", "sim.main", "run", ROBOT, "--virtual", "--no-dynamics", "--no-report"]
+    run = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "run")],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert run.stderr is not None
+    # Before it has found the modules there is nothing to stop.
+    assert any(line.startswith("[2/") for line in iter(run.stderr.readline, ""))
+    run.stderr.close()
+    assert run.wait(programs.limit_s) == 130
+    (failed,) = [e for e in load_recording(tmp_path / "run" / "session.mcap").journal if e.what == "failed"]
+    assert failed.text == "stopped: interrupted"
+    assert failed.deaf == ()
