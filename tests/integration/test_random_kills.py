@@ -4,7 +4,11 @@
 """
 
 import os
+import shutil
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,39 +16,61 @@ import pytest
 from coordinator.recording.run_folder import SESSION, load_recording
 from module_agent.model.errors import EXIT_FAILED, EXIT_LOST
 from sim.processes.launcher import Child, Launcher
+from tests.integration.conftest import MARK, marked_processes
 
 KILLS, SPEED = int(os.environ.get("X5_KILLS", "2")), float(os.environ.get("X5_KILLS_SPEED", "1.0"))
-VICTIMS = ("coordinator", "agent", "world")
-# A run with the short plan takes some fourteen seconds.
-LATEST_S = 12.0
+VICTIMS = ("coordinator", "agent", "world", "launcher")
+# A recording with the short plan takes some twelve seconds.
+LATEST_S = 11.0
 
 
-def started(robot: Launcher) -> tuple[Child, list[Child], Child]:
-    """World, agents and a coordinator."""
-    world = robot.start_world()
-    return world, robot.start_agents(), robot.start_coordinator(quiet=True)
+def launch(robot: Launcher, log: Path) -> Child:
+    """Launch the same as `robot` would, by a program of its own."""
+    config = robot.config
+    command = [sys.executable, "-m", "sim.main", "run", config.robot_file, "--viewer", "none"]
+    command += ["--out", str(config.out), "--listen", config.endpoint, "--network", config.network]
+    with log.open("wb") as output:
+        options = [*command, "--speed", str(SPEED), *config.coordinator_options]
+        return Child("launcher", subprocess.Popen(options, stdout=output, stderr=subprocess.STDOUT), log)
 
 
-@pytest.mark.parametrize("seed", range(KILLS))
-def test_a_random_kill_has_a_named_end_and_the_run_resumes(launcher, programs, seed: int) -> None:
-    draw = np.random.default_rng(seed)
-    robot, which = launcher(), VICTIMS[int(draw.integers(len(VICTIMS)))]
-    robot.config = robot.config._replace(speed=SPEED)
-    world, agents, coordinator = started(robot)
-    victim = {"coordinator": coordinator, "agent": agents[int(draw.integers(2))], "world": world}[which]
-    end_s = time.monotonic() + float(draw.uniform(2.0, LATEST_S)) / SPEED
-    session = robot.config.out / SESSION
-    while coordinator.process.poll() is None and (time.monotonic() < end_s or not session.exists()):
+def kill_at(victim: Child, others: Child, session: Path, after_s: float) -> None:
+    """Kill a process at a time since there is a recording, or when the others have ended."""
+    begun_s = None
+    while others.process.poll() is None and (begun_s is None or time.monotonic() < begun_s + after_s):
+        if begun_s is None and session.exists():
+            begun_s = time.monotonic()
         time.sleep(0.05)
     victim.process.kill()
     victim.process.wait()
 
-    if which != "coordinator":
-        code, said = programs.ended(coordinator)
-        # Lost, or of modules that are there not all were found to begin with.
-        assert code in (0, EXIT_FAILED, EXIT_LOST), said
-        assert "Traceback" not in said
-        assert code == 0 or any(serial in said for serial in robot.config.serials) or "module" in said
+
+@pytest.mark.parametrize("seed", range(KILLS))
+def test_a_random_kill_has_a_named_end_and_the_run_resumes(
+    launcher, programs, nothing_is_left, tmp_path, seed: int
+) -> None:
+    draw = np.random.default_rng(seed)
+    robot, which = launcher(), VICTIMS[int(draw.integers(len(VICTIMS)))]
+    robot.config = robot.config._replace(speed=SPEED)
+    session, after_s = robot.config.out / SESSION, float(draw.uniform(0.0, LATEST_S)) / SPEED
+    if which == "launcher":
+        launched = launch(robot, tmp_path / "launch.log")
+        kill_at(launched, launched, session, after_s)
+        programs.until(lambda: not marked_processes(os.environ[MARK]), "the end of all that it had launched")
+        # Only who is killed outright leaves the folder of its bus.
+        for folder in nothing_is_left.glob("x5-*"):
+            shutil.rmtree(folder)
+    else:
+        world, agents = robot.start_world(), robot.start_agents()
+        coordinator = robot.start_coordinator(quiet=True)
+        victim = {"coordinator": coordinator, "agent": agents[int(draw.integers(2))], "world": world}[which]
+        kill_at(victim, coordinator, session, after_s)
+        if which != "coordinator":
+            code, said = programs.ended(coordinator)
+            # Lost, or of modules that are there not all were found to begin with.
+            assert code in (0, EXIT_FAILED, EXIT_LOST), said
+            assert "Traceback" not in said
+            assert code == 0 or any(serial in said for serial in robot.config.serials) or "module" in said
     recording = load_recording(session)
     assert recording.damage == []
     robot.stop()
@@ -64,5 +90,7 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(launcher, programs, s
     assert code == 0, said
     whole = load_recording(session)
     assert (whole.damage, whole.remarks) == ([], [])
-    assert [event.what for event in whole.journal].count("session") == 2
+    # One that was killed within a fifth of a second has not written that it had begun.
+    before, after = (sum(e.what == "session" for e in each.journal) for each in (recording, whole))
+    assert after == before + 1
     assert done <= {event.step for event in whole.journal if event.what == "done"}
