@@ -6,7 +6,7 @@ hebi-py in the simulator.
 """
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import redirect_stdout
 from importlib import import_module
 from typing import Any, Protocol
@@ -112,6 +112,17 @@ def library(name: str = HEBI) -> Library:
             return import_module(name)
     except ImportError as error:
         raise UsageError(f"the library {name} cannot be imported ({error}); install it: {INSTALL}") from error
+
+
+def log_loader() -> Callable[[str], Any]:
+    """Return what opens the logs of HEBI's programs, `hebi.util.load_log`.
+
+    Raises:
+        UsageError: hebi-py is not installed.
+    """
+    hebi: Any = library()
+    load: Callable[[str], Any] = hebi.util.load_log
+    return load
 
 
 def names_of(values: Sequence[str | None]) -> list[str]:

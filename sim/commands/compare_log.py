@@ -10,12 +10,13 @@ from rich.table import Table
 from coordinator.commands.options import JsonFile
 from coordinator.runtime.command_line import fail, with_options
 from coordinator.runtime.terminal import new_table, print_table, write_result
+from module_agent.hardware.hebi_library import log_loader
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
 from module_agent.model.errors import EXIT_FAILED, UsageError
 from module_agent.model.files import write_json
 from sim.commands.experiment import ModuleOptions, ProfileName
 from sim.real_module.comparison import CommandRefused, SignalRow, compare, simulate
-from sim.real_module.real_log import read_log
+from sim.real_module.real_log import read_hebilog, read_log
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,18 +28,22 @@ class IdealModule(ModuleOptions):
 
 @with_options
 def compare_log(
-    log: Annotated[Path, typer.Argument(help="CSV log of one module alone, strategy 3, factory gains.")],
+    log: Annotated[
+        Path, typer.Argument(help="CSV log or .hebilog of one module alone, strategy 3, factory gains.")
+    ],
     modules: IdealModule,
     kind: Annotated[str, typer.Option("--type", help=f"Module type: {', '.join(CATALOGUE)}.")] = "X5-1",
     out: Annotated[
         Path | None, typer.Option(help="Plot to write; its figures go next to it as JSON [LOG.png].")
     ] = None,
+    module: Annotated[int, typer.Option(min=1, help="Which module of a .hebilog, in its order.")] = 1,
     json_file: JsonFile = None,
 ) -> None:
     """Run a real module's commands through the simulated module and compare what both did."""
     try:
         module_type(kind)
-        recorded = read_log(log)
+        is_hebis = log.suffix.lower() == ".hebilog"
+        recorded = read_hebilog(log, module, log_loader()) if is_hebis else read_log(log)
     except UnknownModuleType as error:
         raise UsageError(f"--type: {error}") from error
     except OSError as error:

@@ -1,9 +1,10 @@
-"""Logs of real modules, as CSV: one row per feedback sample, units in the column names."""
+"""Logs of real modules: CSV with one row per feedback sample and units in the column names, or .hebilog."""
 
 import csv
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,19 @@ _COLUMNS = {
     "pwm": "pwm_command",
 }
 _MAY_BE_UNSET = frozenset({"position_command_rad", "velocity_command_rad_s", "effort_command_nm"})
+# The same in HEBI's feedback, but for the time.
+_HEBI = {
+    "position_rad": "position",
+    "velocity_rad_s": "velocity",
+    "effort_nm": "effort",
+    "position_command_rad": "position_command",
+    "velocity_command_rad_s": "velocity_command",
+    "effort_command_nm": "effort_command",
+    "winding_current_a": "motor_winding_current",
+    "winding_temperature_c": "motor_winding_temperature",
+    "voltage_v": "voltage",
+    "pwm": "pwm_command",
+}
 
 
 def read_log(path: Path) -> RealLog:
@@ -57,6 +71,42 @@ def read_log(path: Path) -> RealLog:
             return _parse(list(csv.reader(file)), str(path))
         except (UnicodeDecodeError, csv.Error) as error:
             raise LogFileError(f"{path}: not a CSV text file: {error}") from error
+
+
+def read_hebilog(path: Path, module: int, load: Callable[[str], Any]) -> RealLog:
+    """Read one module's part of a log that HEBI's programs wrote.
+
+    Feedback that the module sent once and the log has twice is taken once.
+
+    Args:
+        path: the log.
+        module: its place in the group, from 1 on.
+        load: `hebi.util.load_log`, or what stands in for it: iterates over feedback by `feedback_iterate`.
+
+    Raises:
+        LogFileError: it is no log, has no such module, has fewer than two samples, or lacks a reading.
+    """
+    try:
+        log = load(str(path))
+    except OSError as error:
+        raise LogFileError(f"{path}: {error}") from error
+    if not 1 <= module <= log.number_of_modules:
+        raise LogFileError(f"{path}: it has {log.number_of_modules} modules, no module {module}")
+    names = ("hardware_transmit_time_us", *_HEBI.values())
+    rows = [[float(getattr(fed, name)[module - 1]) for name in names] for fed in log.feedback_iterate]
+    table = np.array(rows).reshape(-1, len(names))
+    table = table[np.diff(table[:, 0], prepend=-1.0) > 0.0]
+    if len(table) < 2:
+        raise LogFileError(f"{path}: {len(table)} samples of module {module}; at least 2 are needed")
+    table[:, 0] = 1e-6 * (table[:, 0] - table[0, 0])
+    for field, values in zip(_HEBI, table[:, 1:].T, strict=True):
+        unset = np.flatnonzero(np.isnan(values))
+        if unset.size and field not in _MAY_BE_UNSET:
+            raise LogFileError(
+                f"{path}: sample {unset[0] + 1}: {_HEBI[field]}: is not set; only commands may be"
+            )
+    values = dict(zip(("t_s", *_HEBI), map(read_only, table.T), strict=True))
+    return RealLog(**values)
 
 
 def _parse(rows: list[list[str]], name: str) -> RealLog:

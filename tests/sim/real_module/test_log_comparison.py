@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from scipy.linalg import expm
 from typer.testing import CliRunner
 
+from module_agent.hardware.hebi_library import log_loader
 from module_agent.model.catalogue import CAPACITIES_J_K, RESISTANCES_K_W
 from sim.imperfections.noise_profile import noise_profile, switched
 from sim.main import app
@@ -23,7 +25,7 @@ from sim.real_module.comparison import (
     start_warmth,
 )
 from sim.real_module.plot import plot
-from sim.real_module.real_log import LogFileError, RealLog, read_log
+from sim.real_module.real_log import LogFileError, RealLog, read_hebilog, read_log
 
 REAL_LOG = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "x5-1-sine-log.csv"
 needs_the_log = pytest.mark.skipif(
@@ -267,6 +269,53 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------ the command
+
+
+# ------------------------------------------------------------------ logs of HEBI's programs
+
+
+class HebiLog:
+    """What `hebi.util.load_log` returns: two modules, of which the second one is `log`."""
+
+    number_of_modules = 2
+
+    def __init__(self, log: RealLog, repeated: bool = False, **changes: np.ndarray):
+        names = ["position", "velocity", "effort", "position_command", "velocity_command", "effort_command"]
+        names += ["motor_winding_current", "motor_winding_temperature", "voltage", "pwm_command"]
+        columns = {**dict(zip(names, log[1:], strict=True)), **changes}
+        self.feedback_iterate = [
+            SimpleNamespace(
+                hardware_transmit_time_us=np.array([1, 5_000_000 + round(1e6 * t_s)], np.uint64),
+                **{name: np.array([-1.0, values[k]]) for name, values in columns.items()},
+            )
+            for k, t_s in enumerate(log.t_s)
+            for _ in range(1 + repeated)
+        ]
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_hebis_own_log_is_read_as_the_same_log_in_csv(tmp_path: Path, repeated: bool) -> None:
+    log = made_up()
+    found = read_hebilog(tmp_path / "a.hebilog", 2, lambda path: HebiLog(log, repeated))
+    for name, theirs, ours in zip(RealLog._fields, found, log, strict=True):
+        np.testing.assert_allclose(theirs, ours, atol=1e-6, err_msg=name)
+
+
+def test_of_hebis_log_an_unset_reading_a_missing_module_and_a_file_that_is_none_are_refused(
+    tmp_path: Path,
+) -> None:
+    path, log = tmp_path / "a.hebilog", made_up()
+    broken = np.where(np.arange(len(log.t_s)) == 3, np.nan, log.voltage_v)
+    with pytest.raises(LogFileError, match="sample 4: voltage: is not set"):
+        read_hebilog(path, 2, lambda path: HebiLog(log, voltage=broken))
+    with pytest.raises(LogFileError, match="it has 2 modules, no module 3"):
+        read_hebilog(path, 3, lambda path: HebiLog(log))
+    with pytest.raises(LogFileError, match="1 samples of module 1"):
+        read_hebilog(path, 1, lambda path: HebiLog(log))
+    pytest.importorskip("hebi")
+    path.write_bytes(b"abc" * 100)
+    with pytest.raises(LogFileError, match="is not a valid log file"):
+        read_hebilog(path, 1, log_loader())
 
 
 def written(folder: Path, log: RealLog) -> Path:
