@@ -381,6 +381,43 @@ def test_a_life_in_which_everything_happens_is_the_same_in_both(expiry: str) -> 
     assert repr(compiled) == repr(plain)
 
 
+SWING = WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=0.06, sigma_s=0.02)
+HOT_SWING: list[tuple[Any, ...]] = [
+    ("motion", 0, SWING),
+    ("motion", 1, SWING),
+    ("aim", 2, (0.1, None, None)),
+    ("ticks", 30),
+    *(("renew", k) for k in (0, 1)),
+    ("ticks", 10),
+    ("stop", 1),
+    ("hot", 0, 100.0),
+    ("ticks", 60),
+    ("hot", 0, 50.0),
+    ("ticks", 20),
+    *(("acquire", k) for k in range(3)),
+    ("ticks", 20),
+    ("motion", 1, SWING),
+    ("ticks", 120),
+]
+
+
+@pytest.mark.parametrize("expiry", ["motor_off", "hold", "damping"])
+def test_a_motion_that_is_stopped_expires_or_overheats_is_the_same_in_both(expiry: str) -> None:
+    """A stopped motor brakes, an expired one does what is configured, one at its own limit of heat is off."""
+    safety = (Safety(winding_c=90.0), UNCONFIGURED, UNCONFIGURED)
+    agents = [Agent(is_compiled, 3, expiry, 250.0, safety) for is_compiled in (True, False)]
+    life, states = Life(agents, 5), set()
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+    for action in HOT_SWING:
+        life.act(action)
+        states |= {(module.serial, module.firmware.state) for module in agents[0].host.modules}
+    assert {("A", "moving"), ("A", "fault"), ("B", "moving"), ("B", "stopped"), ("C", "expired")} <= states
+    compiled, plain = (agent.everything for agent in agents)
+    assert repr(compiled) == repr(plain)
+
+
 def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     """An idle module needs its Python objects for its statuses, and for nothing else."""
     agent = Agent(True, 3, "hold", 250.0)
