@@ -36,7 +36,6 @@ MODULE = np.dtype(
         *((name, np.int64) for name in ("low", "high")),
         *((name, np.float64) for name in ("low_rad", "high_rad", "margin_rad")),
         *((name, np.float64) for name in ("max_motor_rad_s", "ceiling_c")),
-        ("configured", np.int64),
         *((name, np.float64) for name in ("min_rad_s", "max_rad_s", "min_nm", "max_nm")),
         *((name, np.float64) for name in ("min_push", "max_push", "braking_rad_s2", "gear_ratio")),
         *((name, np.float64) for name in ("emf_pwm", "stiff_pwm", "load_pwm")),
@@ -300,9 +299,8 @@ def _limit(own: Any, pwm: float, integers: Integers, reading: Floats) -> float:
     ):
         integers[LIMIT] = LIMIT_POSITION
         return 0.0
-    if own.configured:
-        pwm = _within_speed(own, pwm, integers, reading)
-        pwm = _within_push(own, pwm, integers, reading)
+    pwm = _within_speed(own, pwm, integers, reading)
+    pwm = _within_push(own, pwm, integers, reading)
     room_c = own.ceiling_c - reading[WINDING]
     ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
     max_pwm: float = ceiling * reading[VOLTAGE] / NOMINAL_VOLTAGE_V

@@ -1,8 +1,9 @@
 """The output stage of a module: nothing drives the motor but through `MotorGuard.limit`.
 
-Without a configuration it keeps the duty below the winding's ceiling, and never drives out of the type's
-range. A configuration (`control.safety`) adds bounds on the PWM that no gains and no set-point go around.
-Seen at the output, with the motor's speed w and the torque tau read from the spring, the upper ones are
+Without a configuration it keeps the duty below the winding's ceiling and the motor below the speed of its
+type, and never drives out of the type's range. A configuration (`control.safety`) narrows these bounds, which
+no gains and no set-point go around, and adds others. Seen at the output, with the motor's speed w and the
+torque tau read from the spring, the upper ones are
 
     position, speed   E w1 + S (w1 - w) + L tau     w1: the highest speed at this distance from the limit
     torque, current   E w + R i                     i: the highest current, L times the torque
@@ -37,6 +38,9 @@ APPROACH_PER_S = 5.0
 MARGIN_RAD = 0.02
 # The stiffness of the bounds over the back-EMF's own.
 STIFFNESS = 3.0
+# The highest speed of a motor over that of its type. The loops clamp their targets at 1.025 times that speed,
+# and overshoot: a healthy joint does not meet this bound.
+OVERSPEED = 1.1
 # How fast a joint that is outside of its range is led back [rad/s].
 RETURN_RAD_S = 0.1
 # By how much the push is lowered for every Nm over a torque limit [Nm].
@@ -47,7 +51,6 @@ class Bounds(NamedTuple):
     """What bounds one module's PWM; infinite where nothing does.
 
     low, high: action and position of both ends. max_motor_rad_s: the speed at which the motor is unloaded.
-    configured: whether there are more than the type's limits, which are the fields from min_rad_s on.
     """
 
     low: int
@@ -57,7 +60,6 @@ class Bounds(NamedTuple):
     margin_rad: float
     max_motor_rad_s: float
     ceiling_c: float
-    configured: bool
     min_rad_s: float
     max_rad_s: float
     min_nm: float
@@ -98,9 +100,8 @@ def bounds_of(kind: ModuleType, limits: Limits, safety: Safety) -> Bounds:
         margin_rad=min(MARGIN_RAD, 0.125 * (high_rad - low_rad)),
         max_motor_rad_s=kind.gear_ratio * kind.max_speed_rad_s,
         ceiling_c=safety.winding_c + 1.0,
-        configured=safety != UNCONFIGURED,
-        min_rad_s=safety.velocity_rad_s[0],
-        max_rad_s=safety.velocity_rad_s[1],
+        min_rad_s=max(safety.velocity_rad_s[0], -OVERSPEED * kind.max_speed_rad_s),
+        max_rad_s=min(safety.velocity_rad_s[1], OVERSPEED * kind.max_speed_rad_s),
         min_nm=safety.effort_nm[0],
         max_nm=safety.effort_nm[1],
         min_push=max(safety.effort_nm[0] * load_pwm, -current),
@@ -153,9 +154,8 @@ class MotorGuard:
         ):
             self.state = LimitState.POSITION
             return 0.0
-        if own.configured:
-            pwm = self._within_speed(pwm, sample)
-            pwm = self._within_push(pwm, sample)
+        pwm = self._within_speed(pwm, sample)
+        pwm = self._within_push(pwm, sample)
         room_c = own.ceiling_c - sample.winding_temperature_c
         ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
         max_pwm = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V

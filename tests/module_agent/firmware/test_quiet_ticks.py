@@ -196,6 +196,7 @@ ACTIONS = st.one_of(
         st.integers(1, 9),
     ),
     st.tuples(st.just("hot"), st.integers(0, 2), st.floats(100.0, 160.0)),
+    st.tuples(st.just("fast"), st.integers(0, 2), st.floats(-2.0, 2.0)),
     st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([0.0, 12.0, 24.0, 48.0])),
     st.tuples(st.just("clock"), st.integers(0, 2), st.sampled_from([-700, -1, 3, 300])),
 )
@@ -229,6 +230,7 @@ class Life:
         self._tick = 0
         self._q = np.zeros(3)
         self._winding, self._voltage = [40.0] * 3, [24.0] * 3
+        self._fast = [0.0] * 3
         self._sick: dict[int, tuple[str, float, int]] = {}
         self._seq = self._motions = 0
 
@@ -255,6 +257,7 @@ class Life:
                 strict=True,
             )
         )
+        values["motor_velocity_rad_s"] += self._fast[k]
         name, value, left = self._sick.get(k, ("", 0.0, 0))
         if left:
             values[name] = value
@@ -273,6 +276,10 @@ class Life:
             self._winding[k] = rest[1]
         elif what == "voltage":
             self._voltage[k] = rest[1]
+        elif what == "fast":
+            # The motor runs at a share of its type's speed.
+            kind = module_type(TYPES[k])
+            self._fast[k] = rest[1] * kind.gear_ratio * kind.max_speed_rad_s
         elif what == "clock":
             self._now[k] += rest[1] * MS
         else:
@@ -351,6 +358,8 @@ STEPS: list[tuple[Any, ...]] = [
     ("ticks", 30),
     ("sick", 0, "effort_nm", float("nan"), 3),
     ("hot", 2, 153.0),
+    ("fast", 0, 1.3),
+    ("fast", 2, -1.3),
     ("ticks", 20),
     ("stop", 1),
     ("sick", 0, "velocity_rad_s", float("inf"), 9),

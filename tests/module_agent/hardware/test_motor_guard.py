@@ -18,6 +18,7 @@ from module_agent.hardware.motor_guard import (
     HOLD,
     MARGIN_RAD,
     OFF,
+    OVERSPEED,
     RETURN_RAD_S,
     SPRING,
     STOP,
@@ -206,6 +207,22 @@ def test_at_its_speed_limit_the_motor_gets_what_keeps_its_speed(sign: float) -> 
     assert (pwm, state) == (pytest.approx(sign * EMF * 0.5), LimitState.VELOCITY)
     assert driven(limiter, sign, reading(speed=sign * 0.6))[0] == pytest.approx(sign * EMF * (0.5 - 0.3))
     assert driven(limiter, sign * 0.05, reading(speed=sign * 0.5)) == (sign * 0.05, LimitState.NONE)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_configuration_a_motor_keeps_to_the_speed_of_its_type(sign: float) -> None:
+    """Full PWM would drive an X5-9 that carries nothing at 4.8 rad/s, where its type is made for 1.466."""
+    most = OVERSPEED * KIND.max_speed_rad_s
+    pwm, state = driven(guard(), sign, reading(speed=sign * most))
+    assert pwm == pytest.approx(sign * EMF * most)
+    assert state is LimitState.VELOCITY
+    # At the speed that loops allow at the most, PWM for a load of half the type's torque is left.
+    clamped = reading(speed=sign * KIND.velocity_clamp_rad_s)
+    needed = sign * (EMF * KIND.velocity_clamp_rad_s + LOAD * 0.5 * KIND.max_effort_nm)
+    loaded = clamped._replace(effort_nm=sign * 0.5 * KIND.max_effort_nm)
+    assert driven(guard(), needed, loaded) == (needed, LimitState.NONE)
+    # A wider limit than the type's is none.
+    assert driven(guard(velocity_rad_s=9.0), sign, reading(speed=sign * most))[0] == pwm
 
 
 def test_speed_limits_may_differ_by_direction() -> None:
