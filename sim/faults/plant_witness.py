@@ -36,6 +36,13 @@ class _Held(NamedTuple):
     until_ns: int
 
 
+class _Request(NamedTuple):
+    """What was asked of a lease: by which endpoint, and whether it was to be acquired."""
+
+    by: str
+    acquires: bool
+
+
 class PlantWitness:
     """Notes violations by the motors: `violations` maps each kind to the first case of it, as a sentence.
 
@@ -49,7 +56,7 @@ class PlantWitness:
         self._sent_ns: dict[str, int] = {}
         self._accepted_ns: dict[str, int] = {}
         self._stopped: set[str] = set()
-        self._askers: dict[tuple[str, str, int], str] = {}
+        self._requests: dict[tuple[str, str, int], _Request] = {}
         self._leases: dict[str, _Held] = {}
 
     def tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
@@ -78,16 +85,16 @@ class PlantWitness:
             self._stopped.add(parts.serial)
             return
         self._accepted_ns[parts.serial] = now_ns
-        self._stopped.discard(parts.serial)
         if parts.leaf is not Leaf.LEASE:
             return
         if ack.holder is None:
             self._leases.pop(parts.serial, None)
             return
-        held, asker = (
-            self._leases.get(parts.serial),
-            self._askers.get((parts.serial, ack.holder, ack.re), "?"),
-        )
+        held = self._leases.get(parts.serial)
+        asker, acquires = self._requests.get((parts.serial, ack.holder, ack.re), _Request("?", True))
+        if acquires:
+            # Nothing else ends a stop. A keep-alive of a motion that is done is accepted after it, too.
+            self._stopped.discard(parts.serial)
         if held is not None and held.boot == ack.boot and now_ns < held.until_ns and held.by != asker:
             self._note("two holders", f"module {parts.serial} is held by {held.by} and obeys {asker}")
         self._leases[parts.serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns)
@@ -98,7 +105,8 @@ class PlantWitness:
         except WireError:
             return
         # A copy of a request is no request of who copied it.
-        self._askers.setdefault((serial, request.sender, request.seq), endpoint)
+        asked = _Request(endpoint, request.action == "acquire")
+        self._requests.setdefault((serial, request.sender, request.seq), asked)
 
     def check(self, robot: VirtualRobot) -> None:
         """Judge what the motors did in the tick that ends."""
