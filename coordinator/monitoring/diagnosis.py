@@ -37,6 +37,8 @@ from module_agent.model.regressor import PER_BODY
 MIN_SHIFT_M, MIN_TURN_RAD = 3e-3, 3e-3
 # The same under a payload, under which links give by more.
 LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
+# A robot is moved when one of its joints is faster than that.
+MOVING_RAD_S = 0.02
 # Friction changes by more than that with the weather.
 MIN_FRICTION = 0.1
 # A payload leaves no more of the misfit than chance does in one window of so many.
@@ -46,10 +48,14 @@ MIN_SIGMAS = 5.0
 
 
 class SegmentInformation(NamedTuple):
-    """What one stretch says: evidence of torques, IMUs (own parameters first) and every drive."""
+    """What one stretch says: evidence of torques, IMUs (own parameters first) and every drive.
+
+    moved: whether a joint moved in it.
+    """
 
     start_ns: int
     end_ns: int
+    moved: bool
     information: tuple[JointInformation, ...]
     imu: WhitenedRows
     drives: tuple[WhitenedRows | None, ...]
@@ -81,6 +87,7 @@ def segment_information(reference: Reference, segment: DataSegment) -> SegmentIn
     return SegmentInformation(
         int(segment.t_ns[0]),
         int(segment.t_ns[-1]),
+        bool((np.abs(segment.qd_rad_s) > MOVING_RAD_S).any()),
         information_of(reference.chain, segment),
         imu_rows(reference.imu_model, segment),
         drives,
@@ -134,7 +141,8 @@ def _link(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
 ) -> Detection | None:
     chain = reference.chain
-    if not chain.linked:
+    # At rest an IMU shows which way is down, by its own errors and in whatever pose, and no length.
+    if not chain.linked or 2 * sum(segment.moved for segment in window) < len(window):
         return None
     later = without_own(joined([segment.imu for segment in window]), reference.imu_model.own_sigma)
     found = reference.imu.test(later)
