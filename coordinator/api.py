@@ -36,6 +36,7 @@ from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, SESSION
 from coordinator.recording.run_folder import load_recording as read_recording
+from coordinator.recording.versions import current_run
 from coordinator.synchronisation.signals import Signals
 from coordinator.torque_control.gravity_model import gravity_model_of_result, read_result
 from module_agent.model.catalogue import module_type
@@ -141,15 +142,17 @@ class SavedRun:
 
 
 def load_run(folder: Path | str) -> SavedRun:
-    """Read a finished run back.
+    """Read a finished run back, or the current version of a robot that `attend` measured again.
 
     Args:
         folder: the run's folder, which holds `result.json`.
 
     Raises:
         BaselineError: the folder holds no result, or one that cannot be read.
+        VersionError: see `current_run`.
     """
-    return SavedRun(Path(folder), read_result(Path(folder)))
+    run = current_run(Path(folder))
+    return SavedRun(run, read_result(run))
 
 
 def load_recording(path: Path | str) -> Recording:

@@ -14,6 +14,7 @@ from coordinator.merge.run_arrays import RunArraysError
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import MEASURED, SESSION, load_recording
 from coordinator.recording.session_file import SessionFileError
+from coordinator.recording.versions import current_run
 from module_agent.model.catalogue import ImuKind, UnknownModuleType
 from module_agent.model.chain import Chain
 from module_agent.model.errors import UsageError
@@ -59,14 +60,16 @@ class BaselineRobot(NamedTuple):
 
 
 def load_baseline(folder: Path) -> BaselineRobot:
-    """Read a run's folder, and identify its robot again from the recording.
+    """Read a run's folder, or its current version, and identify its robot again from the recording.
 
     A run with a baseline of its own holds that recording too, and both are combined. The recording is read,
     not `result.json`, since two sessions are compared by their sensor readings.
 
     Raises:
         BaselineError: there is no recording, or not of a complete exploration.
+        VersionError: see `current_run`.
     """
+    folder = current_run(folder)
     path = folder / SESSION
     if not path.is_file():
         raise BaselineError(f"{folder} holds no {SESSION}: give the folder of a run that has finished")

@@ -9,6 +9,7 @@ import numpy as np
 
 from coordinator.recording.recording import ModuleRecord, Recording
 from coordinator.recording.run_folder import ASIDE, RESULT, SESSION, URDF, load_recording
+from coordinator.recording.versions import current_run
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.synchronisation.signals import Signals, module_signals
 from module_agent.model.chain import Array
@@ -44,13 +45,15 @@ class ExportedRun(NamedTuple):
 
 
 def read_exported(folder: Path) -> ExportedRun:
-    """Read a run, finished or not, for export.
+    """Read a run, finished or not, or its current version, for export.
 
     Raises:
+        VersionError: see `current_run`.
         UsageError: the folder holds no recording of a run.
         SessionFileError: the recording cannot be read.
         DataError: it has no samples of any module.
     """
+    folder = current_run(folder)
     session = next((folder / name for name in (SESSION, ASIDE) if (folder / name).is_file()), None)
     if session is None:
         raise UsageError(f"{folder} holds no {SESSION}: give the folder of a run")

@@ -59,6 +59,7 @@ from coordinator.recording.run_folder import (
     open_run_folder,
 )
 from coordinator.recording.session_file import SessionWriter, read_session
+from coordinator.recording.versions import current_run
 from coordinator.report.plots import MissingPlots
 from coordinator.report.run_report import result_markdown, write_report
 from coordinator.session.information_requests import InformationRequests
@@ -146,7 +147,9 @@ class Run:
                 "too, and needs them: set it to false"
             )
         before = load_baseline(config.baseline) if config.baseline is not None and not config.resume else None
-        earlier = each_once(one for run in config.measured for one in read_calibration(run / CALIBRATION))
+        earlier = each_once(
+            one for run in config.measured for one in read_calibration(current_run(run) / CALIBRATION)
+        )
         crashed = open_run_folder(config.out, config.resume, config.robot)
         if earlier:
             write_calibration(config.out / MEASURED, earlier)

@@ -12,6 +12,7 @@ from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import parameter_transform
 from coordinator.identification.result import ModuleBodyPart, Result
 from coordinator.recording.run_folder import RESULT
+from coordinator.recording.versions import current_run
 from module_agent.model.chain import Array, Chain
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
@@ -36,12 +37,13 @@ class GravityModel(NamedTuple):
 
 
 def read_result(folder: Path) -> Result:
-    """Read the result of a run from its folder.
+    """Read the result of a run, or of its current version, from its folder.
 
     Raises:
         BaselineError: the folder holds no result, or one that cannot be read.
+        VersionError: see `current_run`.
     """
-    path = folder / RESULT
+    path = current_run(folder) / RESULT
     if not path.is_file():
         raise BaselineError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
     try:
