@@ -40,8 +40,11 @@ def retained_rows(record: ModuleRecord) -> int:
 class LiveMonitor:
     """Monitoring over one messenger, which is given `record` to record with."""
 
-    def __init__(self, monitor: Monitor, clock: Clock, sender: str, report: Report):
+    def __init__(
+        self, monitor: Monitor, clock: Clock, sender: str, report: Report, update_s: float = UPDATE_S
+    ):
         self.recording = Recording()
+        self._update_s = update_s
         self._monitor = monitor
         self._clock = clock
         self._sender = sender
@@ -63,13 +66,14 @@ class LiveMonitor:
         mapped_ns = 0
         try:
             while (until_ns is None or self._clock() < until_ns) and not enough():
-                await asyncio.sleep(UPDATE_S)
+                await asyncio.sleep(self._update_s)
                 self._note_presence(messenger)
                 if self._clocks is None or self._clock() - mapped_ns > REMAP_S * 1e9:
                     self._map_clocks()
                     mapped_ns = self._clock()
                 if self._clocks is not None:
                     self._look(self._clocks)
+                self._forget()
         finally:
             asking.cancel()
             await asyncio.gather(asking, return_exceptions=True)
@@ -79,6 +83,9 @@ class LiveMonitor:
         update = self._monitor.advance(self.recording, clocks)
         if any(update):
             self._report(update)
+
+    def _forget(self) -> None:
+        """Forget what was looked at, and what waits for modules that are not there."""
         for record in self.recording.modules.values():
             record.forget(retained_rows(record), MAX_TRIPS)
         for found in self.recording.estimates.values():

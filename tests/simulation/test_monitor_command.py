@@ -10,41 +10,18 @@ from typer.testing import CliRunner
 
 from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.main import app
-from coordinator.runtime.terminal import Terminal
-from sim.benchmark.cases.monitoring import Subject
-from sim.geometry.link_parts import FreePose
-from sim.robot.robot_file import load_robot
-from sim.robot.variants import loaded
-from sim.virtual_time.robot import VirtualRobot
-from sim.virtual_time.run import VirtualConfig, run_virtual
+from tests.simulation.known_arm import ARM, GRASPED_S, lived
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("monitoring")
 
-ARM = load_robot("a2085_03")
-HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
-GRASPED_S = 20.0
-
-
-def lived(out: Path, day: int, grasps: bool, dynamics: bool = True) -> Path:
-    plan = Subject(brief=True).plan.model_copy(update={"dynamics": dynamics})
-
-    def between(robot: VirtualRobot) -> None:
-        if grasps:
-            full = loaded(ARM, ARM.serials[-1], HELD)
-            robot.loop.schedule_ns(round(GRASPED_S * 1e9), lambda: robot.world.become(full))
-
-    config = VirtualConfig(ARM, out, seed=6, noise_seed=day, network="lan", noise="x5", plan=plan)
-    run_virtual(config, Terminal(True), between)
-    return out
-
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def known(known_arm: Path) -> Iterator[Path]:
     """The run that the robot is known from; the commands of this file identify its robot once."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("coordinator.commands.monitor.load_baseline", cache(load_baseline))
-        yield lived(tmp_path_factory.mktemp("watch") / "known", 0, False)
+        yield known_arm
 
 
 def watch(*words: str) -> tuple[int, str]:

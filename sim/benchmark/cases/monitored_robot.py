@@ -85,7 +85,7 @@ def monitor_robot(
             listener.start()
             attending = asyncio.create_task(watch.watch(listener))
             try:
-                await _move(group, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
+                await move_about(group, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
             finally:
                 attending.cancel()
                 (failure,) = await asyncio.gather(attending, return_exceptions=True)
@@ -97,7 +97,7 @@ def monitor_robot(
         robot.complete(live())
 
 
-async def _move(
+async def move_about(
     group: ModuleGroup,
     messenger: Messenger,
     motions: Sequence[RobotMotion],
@@ -105,6 +105,11 @@ async def _move(
     until_ns: int,
     loop: VirtualLoop,
 ) -> None:
+    """Run motions one after the other, over and over until a time [ns], on a robot of so many modules.
+
+    Raises:
+        ModuleLost, RobotStopped: see `ModuleGroup`.
+    """
     while len(messenger.alive) < count:
         await asyncio.sleep(0.05)
     await group.meet(sorted(messenger.alive))

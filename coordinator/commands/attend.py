@@ -1,0 +1,90 @@
+"""`x5-coordinator attend`: stay with a known robot, and say when it is not the known one any more."""
+
+import asyncio
+import contextlib
+from datetime import UTC, datetime
+from typing import Annotated
+
+import typer
+
+from coordinator.attendant.attend_session import AttendSession, Site
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
+from coordinator.commands.views.attend import AttendScreen
+from coordinator.live_robot.connection import new_sender, open_connection
+from coordinator.monitoring.reference import ALARMS_PER_HOUR
+from coordinator.recording.versions import Versions
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.event_loop import ScaledLoop
+from coordinator.runtime.event_loop import attend as attend_loop
+from coordinator.runtime.terminal import new_table, print_table
+from coordinator.torque_control.gravity_model import read_result
+from module_agent.model.errors import EXIT_FINDING
+
+
+def utc_now() -> str:
+    """Return the date and time, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@with_options
+def attend(
+    baseline: DynamicsFolder,
+    at: ConnectOptions,
+    history: Annotated[
+        bool, typer.Option("--history", help="List the versions of the model, and end.")
+    ] = False,
+    use: Annotated[
+        int | None, typer.Option(metavar="N", help="Make version N the current one again, and end.")
+    ] = None,
+    for_s: Annotated[
+        float | None, typer.Option("--for", min=1.0, help="End after so many seconds [at Ctrl-C].")
+    ] = None,
+    alarms_per_hour: Annotated[
+        float, typer.Option(min=1e-6, max=1e3, help="Accepted rate of the monitor's false alarms [1/h].")
+    ] = ALARMS_PER_HOUR,
+    json_file: JsonFile = None,
+    speed: Speed = 1.0,
+) -> None:
+    """Stay with a known robot, and say when it is not the known one any more.
+
+    Modules that come, go or are exchanged, links that are displaced, and payloads that stay are said; nothing
+    is commanded. Exit codes: 0 nothing changed, 4 something did, others as of `run`.
+    """
+    versions = Versions(baseline)
+    if use is not None:
+        versions.choose(use, utc_now())
+    if history or use is not None:
+        _print_history(versions)
+        return
+    loop = ScaledLoop(speed)
+    place = at.place(read_result(baseline).robot)
+    screen = AttendScreen(json_file, at.quiet)
+    # The hub of the agents, if there is no other, stays as long as this program.
+    hub = open_connection(place, screen.note)
+    site = Site(
+        robot=place.robot,
+        connect=lambda: open_connection(place, lambda text: None).transport,
+        clock=loop.clock_ns,
+        post=loop.call_soon_threadsafe,
+        sender=new_sender(),
+        utc=utc_now,
+    )
+    session = AttendSession(site, versions, screen, alarms_per_hour=alarms_per_hour)
+    until_ns = None if for_s is None else loop.clock_ns() + round(for_s * 1e9)
+    try:
+        # A signal ends it in order.
+        with screen, contextlib.suppress(asyncio.CancelledError):
+            attend_loop(loop, session.run(until_ns))
+    finally:
+        hub.transport.close()
+    if session.changed:
+        raise typer.Exit(EXIT_FINDING)
+
+
+def _print_history(versions: Versions) -> None:
+    current = versions.current_number
+    table = new_table(f"{versions.folder}: version {current} holds", "time | what | version | why | found")
+    for entry in versions.history:
+        why, found = "\n".join(entry.why), "\n".join(entry.found)
+        table.add_row(entry.utc, entry.what, str(entry.version), why, found)
+    print_table(table)
