@@ -44,6 +44,8 @@ _CHUNK_HEAD_BYTES = 28
 _CHUNK_MARK = b"\x04\x00\x00\x00zstd"
 _MARK_AT = _HEAD.size + _CHUNK_HEAD_BYTES
 _FOOTER = struct.Struct("<QQI")
+# The end of the data has its checksum only. Every chunk is followed by indices, whose opcode is one bit away.
+_DATA_END_BYTES = 4
 _MAX_CHUNK_BYTES = 1 << 30
 _OPCODES = frozenset(map(int, Opcode))
 _UNREADABLE = (McapError, ZstdError, EndOfFile, struct.error, ValueError, MemoryError)
@@ -231,6 +233,8 @@ def _next_chunk(data: mmap.mmap, start: int) -> int | None:
 
 def _is_one_record(data: mmap.mmap, opcode: int, start: int, end: int) -> bool:
     """Return whether a record's length is believable: a damaged one would swallow the chunks after it."""
+    if opcode == Opcode.DATA_END:
+        return end - start == _HEAD.size + _DATA_END_BYTES
     if opcode != Opcode.CHUNK:
         return data.find(_CHUNK_MARK, start, end) < 0
     mark = start + _MARK_AT

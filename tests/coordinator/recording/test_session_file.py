@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -222,3 +223,30 @@ def test_a_recording_ends_at_its_limit_and_is_whole_up_to_there(
     assert read[:-1] == entries[: len(read) - 1]
     assert 50 < len(read) < 2000
     assert read[-1].kind == "journal"
+
+
+def test_a_record_that_is_turned_into_the_end_of_the_data_is_reported(
+    tmp_path: Path, wire: SimpleNamespace
+) -> None:
+    """Byte 8 is the header's opcode; that of the indices after every chunk is one flipped bit away."""
+    path, entries = tmp_path / "session.mcap", _entries(wire, 100)
+    _write(path, entries).close()
+    content = path.read_bytes()
+    starts, at = [], len(MCAP0_MAGIC)
+    while content[at] != Opcode.DATA_END:
+        starts.append(at)
+        at += 9 + int.from_bytes(content[at + 1 : at + 9], "little")
+    assert starts[0] == 8
+    assert {content[start] for start in starts} >= {Opcode.CHUNK, Opcode.MESSAGE_INDEX}
+    for start in starts:
+        altered = bytearray(content)
+        altered[start] = Opcode.DATA_END
+        path.write_bytes(altered)
+        reports: list[str] = []
+        read = list(read_session(path, reports.append))
+        (report,) = reports
+        assert f"from byte {start} to" in report
+        # No more is lost than the chunk itself.
+        kept = iter(entries)
+        assert all(entry in kept for entry in read)
+        assert len(read) >= (85 if content[start] == Opcode.CHUNK else 100)
