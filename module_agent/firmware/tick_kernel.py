@@ -303,7 +303,8 @@ def _limit(own: Any, pwm: float, integers: Integers, reading: Floats) -> float:
     pwm = _within_push(own, pwm, integers, reading)
     room_c = own.ceiling_c - reading[WINDING]
     ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
-    max_pwm: float = ceiling * reading[VOLTAGE] / NOMINAL_VOLTAGE_V
+    voltage_v = reading[VOLTAGE] if reading[VOLTAGE] > 0.0 else 0.0
+    max_pwm: float = ceiling * voltage_v / NOMINAL_VOLTAGE_V
     if -max_pwm <= pwm <= max_pwm:
         return pwm
     integers[LIMIT] |= LIMIT_TEMPERATURE if ceiling != 0.0 else LIMIT_OVER_TEMPERATURE

@@ -158,7 +158,9 @@ class MotorGuard:
         pwm = self._within_push(pwm, sample)
         room_c = own.ceiling_c - sample.winding_temperature_c
         ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
-        max_pwm = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V
+        # A voltage below zero is no supply to drive with.
+        voltage_v = sample.voltage_v if sample.voltage_v > 0.0 else 0.0
+        max_pwm = ceiling * voltage_v / NOMINAL_VOLTAGE_V
         if -max_pwm <= pwm <= max_pwm:
             return pwm
         self.state |= LimitState.TEMPERATURE if ceiling else LimitState.OVER_TEMPERATURE

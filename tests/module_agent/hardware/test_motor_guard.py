@@ -248,8 +248,8 @@ def test_a_torque_limit_is_the_current_that_would_make_it_in_a_gear_without_loss
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_more_torque_than_the_limit_lowers_the_push_to_nothing_and_never_reverses_it(sign: float) -> None:
     limiter = guard(effort_nm=3.0)
-    some = driven(limiter, sign, reading(effort_nm=sign * 3.5))[0]
-    assert some == pytest.approx(sign * LOAD * 1.0)
+    some = driven(limiter, sign, reading(effort_nm=sign * 3.25))[0]
+    assert some == pytest.approx(sign * LOAD * 2.0)
     assert driven(limiter, sign, reading(effort_nm=sign * 9.0)) == (0.0, LimitState.EFFORT)
     assert driven(limiter, -sign * 0.05, reading(effort_nm=sign * 9.0)) == (-sign * 0.05, LimitState.NONE)
 
@@ -279,12 +279,48 @@ def test_a_winding_limit_moves_the_ceiling() -> None:
     assert driven(limiter, 1.0, reading(winding_temperature_c=90.0)) == (0.0, LimitState.OVER_TEMPERATURE)
 
 
-def test_all_limits_that_act_are_named() -> None:
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_all_limits_that_act_are_named(sign: float) -> None:
     limiter = guard(position_rad=RANGE, effort_nm=0.5, winding_c=90.0)
-    _, state = driven(limiter, -1.0, reading(q=-0.3, winding_temperature_c=89.0))
+    _, state = driven(limiter, sign, reading(q=sign * 0.3, winding_temperature_c=89.0))
     assert state == LimitState.POSITION | LimitState.EFFORT
-    _, state = driven(limiter, -1.0, reading(q=-0.3, winding_temperature_c=90.0))
+    _, state = driven(limiter, sign, reading(q=sign * 0.3, winding_temperature_c=90.0))
     assert state == LimitState.POSITION | LimitState.EFFORT | LimitState.OVER_TEMPERATURE
+
+
+def test_what_is_no_number_drives_no_motor() -> None:
+    assert driven(guard(), NAN, reading()) == (0.0, LimitState.NONE)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_at_the_end_of_its_types_range_a_motor_is_free_and_beyond_it_only_outward_pwm_is_taken(
+    sign: float,
+) -> None:
+    snake = guard("SEA-snake")
+    assert driven(snake, sign * 0.3, reading(q=sign * 1.5708)) == (sign * 0.3, LimitState.NONE)
+    assert driven(snake, sign * 0.3, reading(q=sign * 1.5709)) == (0.0, LimitState.POSITION)
+    assert driven(snake, 0.0, reading(q=sign * 1.6)) == (0.0, LimitState.NONE)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_winding_as_hot_as_it_may_be_or_hotter_gets_nothing(sign: float) -> None:
+    for winding_c in (154.0, 154.5, 155.0, 156.0, 300.0):
+        sample = reading(winding_temperature_c=winding_c)
+        assert driven(guard(), sign * 0.3, sample) == (0.0, LimitState.OVER_TEMPERATURE), winding_c
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_exactly_at_its_ceiling_a_pwm_is_not_limited(sign: float) -> None:
+    hot = reading(winding_temperature_c=150.0)
+    ceiling, state = driven(guard(), sign, hot)
+    assert (ceiling, state) == (pytest.approx(sign * 0.8), LimitState.TEMPERATURE)
+    assert driven(guard(), ceiling, hot) == (ceiling, LimitState.NONE)
+
+
+@pytest.mark.parametrize("pwm", [-0.3, 0.0, 0.3])
+def test_without_a_supply_and_with_one_that_reads_below_zero_there_is_no_pwm(pwm: float) -> None:
+    for voltage_v in (0.0, -24.0):
+        assert driven(guard(), pwm, reading(voltage_v=voltage_v))[0] == 0.0
 
 
 def test_the_brake_is_bounded_like_any_command() -> None:
@@ -306,7 +342,7 @@ SIZE = st.sampled_from([0.01, 1.0, 100.0, INF])
     st.one_of(ANY, st.just(NAN), st.just(INF), st.just(-INF)),
     st.tuples(*(st.floats(-1e4, 1e4),) * 5),
     st.floats(-50.0, 400.0),
-    st.floats(0.0, 100.0),
+    st.floats(-100.0, 100.0),
     st.builds(
         Safety,
         position_rad=st.sampled_from([(-INF, INF), (-0.5, 0.5), (-INF, 0.1), (0.0, 1e-6)]),
@@ -324,5 +360,5 @@ def test_whatever_is_asked_and_read_the_pwm_is_finite_and_below_the_ceiling(
     sample = reading(q, speed, stretch, effort_nm=effort, motor_current_a=current)
     sample = sample._replace(winding_temperature_c=winding_c, voltage_v=voltage_v)
     limited, _ = driven(limiter, pwm, sample)
-    assert abs(limited) <= voltage_v / 48.0
+    assert abs(limited) <= max(voltage_v, 0.0) / 48.0
     assert not (winding_c >= safety.winding_c and limited)
