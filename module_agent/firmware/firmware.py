@@ -339,7 +339,6 @@ class Firmware:
                 self.last_rest = self._record
         self._motion = None
         self._announced_until_ns = self._now_ns + ANNOUNCED_NS
-        self._status_due_ns = 0
 
     def _receive(self, incoming: Incoming) -> None:
         try:
@@ -363,7 +362,7 @@ class Firmware:
                 end = min(message.end_row, message.first_row + MAX_ROWS_PER_ANSWER)
                 return encode(self._feedback(message.first_row, end))
             case Stop():
-                self._stop(f"stopped by {message.sender}: {message.why}"[:512])
+                self._stop(f"stopped by {message.sender}: {message.why}")
             case LeaseRequest():
                 self._act_lease(message)
             case MotionCommand():

@@ -11,9 +11,12 @@ from hypothesis import strategies as st
 
 from module_agent.control.gains import catalogue_limits
 from module_agent.control.motion import effort_profile
+from module_agent.control.safety import Safety
+from module_agent.firmware.admission import Lease
 from module_agent.firmware.config import FirmwareConfig, check_config
-from module_agent.firmware.firmware import Incoming, Publication
+from module_agent.firmware.firmware import Incoming, Publication, acknowledgement
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
+from module_agent.firmware.tick_kernel import BRAKE, FOLLOW, MOTION
 from module_agent.hardware.hardware import SensorSample
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.errors import UsageError
@@ -39,7 +42,7 @@ from module_agent.wire.messages import (
     Stop,
 )
 from module_agent.wire.proof import proven
-from module_agent.wire.refusal import Refusal
+from module_agent.wire.refusal import Refusal, WireError
 from tests.module_agent.firmware_bench import BOOT, MS, Bench, refused
 from tests.module_agent.wired_firmware import WiredFirmware
 
@@ -299,6 +302,16 @@ def test_release_turns_the_motor_off() -> None:
     assert bench.firmware.state == "idle"
 
 
+def test_release_ends_a_motion_and_says_that_it_was_superseded() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(5)
+    assert bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))).accepted
+    motion = bench.status().motion
+    assert motion is not None
+    assert (motion.outcome, motion.end_row is not None) == ("superseded", True)
+
+
 def test_a_motion_beyond_the_position_limits_is_refused_with_both_ranges() -> None:
     bench = Bench(kind="SEA-snake")
     bench.acquire()
@@ -455,8 +468,42 @@ def test_an_acquire_that_was_sent_before_a_stop_does_not_undo_it() -> None:
     early = encode(LeaseRequest(**bench.head(action="acquire")))
     bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="anybody"))
     assert refused(bench.ask(Leaf.LEASE, early), Refusal.STALE)
+    # What was sensed in the tick of the stop had been sent before it.
+    assert refused(bench.acquire(echo_ns=bench.now - MS), Refusal.STALE)
+    assert refused(bench.ask(Leaf.LEASE, early), Refusal.STALE)
     bench.ticks(2)
     assert bench.acquire().accepted
+
+
+def targets(bench: Bench) -> tuple[float, ...]:
+    """Return the position, velocity and effort that the module follows."""
+    return bench.firmware.quiet_state().targets
+
+
+@pytest.mark.parametrize("is_moving", [False, True])
+def test_acquiring_again_holds_what_was_held_and_not_where_the_joint_is_pushed_to(is_moving: bool) -> None:
+    bench = Bench()
+    bench.acquire()
+    assert targets(bench) == (0.2, 0.0, pytest.approx(math.nan, nan_ok=True))
+    if is_moving:
+        bench.move(pattern=GoTo(target_rad=0.8, max_speed_rad_s=1.0))
+        bench.ticks(200)
+    before = targets(bench)
+    bench.position = 0.15
+    assert bench.acquire().accepted
+    assert targets(bench) == (before[0], 0.0, pytest.approx(math.nan, nan_ok=True))
+    assert (before[0] > 0.21) is is_moving
+
+
+def test_a_motion_that_is_done_holds_its_end_and_its_last_effort() -> None:
+    bench = Bench()
+    bench.acquire()
+    efforts = effort_profile([0.5, 1.0, 1.5], 20 * MS)
+    assert bench.move(pattern=Rest(duration_s=0.04), effort=efforts).accepted
+    bench.position = 0.15
+    bench.ticks(50)
+    assert bench.firmware.state == "armed"
+    assert targets(bench) == (0.2, 0.0, 1.5)
 
 
 @pytest.mark.parametrize(
@@ -835,3 +882,126 @@ def test_a_clock_before_its_zero_is_a_fault_that_is_named_and_not_the_end() -> N
     published = len(bench.published)
     bench.ticks(100)
     assert len(bench.published) > published
+
+
+# ------------------------------------------------------------------ what it says, and from when on
+
+
+def test_a_fresh_module_has_nothing_to_say() -> None:
+    bench = Bench()
+    status = bench.status()
+    assert (status.dropped_events, status.expiries, status.refusals, status.note) == (0, 0, {}, "")
+    assert (status.motion, bench.firmware.last_rest) == (None, None)
+    bench.acquire()
+    assert bench.status().note == ""
+
+
+def test_an_answer_names_the_command_that_was_taken_and_a_refusal_its_reason() -> None:
+    bench = Bench()
+    answer = bench.acquire()
+    assert (answer.re, answer.reason, answer.detail) == (bench.seq, "", "")
+    answer = bench.setpoint(1e6)
+    assert (answer.re, answer.reason) == (0, "limit")
+
+
+def test_a_long_story_is_cut_to_what_a_message_holds() -> None:
+    head = {"serial": "A", "boot": BOOT, "seq": 1}
+    answer = acknowledgement(head, Lease(), 0, 1, WireError(Refusal.LIMIT, 600 * "x"))
+    assert answer.detail == 512 * "x"
+    bench = Bench()
+    bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="me", why=512 * "y"))
+    assert bench.status().note == f"stopped by me: {512 * 'y'}"[:512]
+
+
+def test_a_command_lives_its_lifetime_from_the_zero_of_the_clock_to_the_nanosecond() -> None:
+    kind = CATALOGUE["X5-9"]
+    config = FirmwareConfig("A", kind, BOOT, catalogue_limits(kind))
+    wired, rest = WiredFirmware(config), Bench()
+    acquire = LeaseRequest(**rest.head(action="acquire", token=0, echo_ns=0))
+    for late_ns, state in ((0, "armed"), (1, "expired")):
+        sample = SensorSample(config.lifetime_ns + late_ns, 0, *(0.0,) * 6, 40.0, 24.0, *(0.0,) * 6)  # type: ignore[call-arg]
+        wired.tick(sample, [] if late_ns else [Incoming(Leaf.LEASE, encode(acquire), None)])
+        assert wired.firmware.state == state
+
+
+@pytest.mark.parametrize("is_hot", [False, True])
+def test_a_clock_before_its_zero_is_said_at_once(is_hot: bool) -> None:
+    """Whatever the module was: at a time of 0 no status waits for its turn."""
+    bench = Bench()
+    bench.winding_c = 155.0 if is_hot else 40.0
+    bench.ticks(10)
+    assert (bench.firmware.state == "fault") is is_hot
+    bench.published.clear()
+    bench.now = -5_000 * MS
+    bench.tick()
+    (status,) = [decode(Status, o.payload) for o in bench.published if o.leaf is Leaf.STATUS]
+    assert (status.state, status.t_ns) == ("fault", 0)
+
+
+def test_a_stop_in_the_first_tick_finds_a_motor_that_is_off() -> None:
+    kind = CATALOGUE["X5-9"]
+    config = FirmwareConfig("A", kind, BOOT, catalogue_limits(kind), feedback_rate_hz=1000.0, batch_rows=1)
+    sample = SensorSample(5 * MS, 5 * MS, *(0.0,) * 6, 40.0, 24.0, *(0.0,) * 6)  # type: ignore[call-arg]
+    stop = encode(Stop(serial="A", boot=0, seq=1, sender="me"))
+    _, out = WiredFirmware(config).tick(sample, [Incoming(Leaf.STOP, stop, None)])
+    (block,) = [o.payload for o in out if isinstance(o, Publication) and o.leaf is Leaf.FEEDBACK]
+    (row,) = unpack(decode(Feedback, block, MAX_MESSAGE_BYTES))
+    assert STATE_NAMES[row["state"]] == "stopped"
+    for name in ("position_command_rad", "velocity_command_rad_s", "effort_command_nm"):
+        assert math.isnan(row[name]), name
+
+
+# ------------------------------------------------------------------ what quiet ticks are told
+
+
+def told(bench: Bench) -> tuple[Any, ...]:
+    state = bench.firmware.quiet_state()
+    return state.source, state.commanded, state.in_fault, state.motion is not None, state.motion_id
+
+
+def test_quiet_ticks_follow_a_motion_until_it_is_done() -> None:
+    bench = Bench()
+    assert told(bench) == (FOLLOW, False, False, False, 0)
+    bench.acquire()
+    assert told(bench) == (FOLLOW, True, False, False, 0)
+    bench.move(5, Rest(duration_s=0.05))
+    assert told(bench) == (MOTION, True, False, True, 5)
+    bench.ticks(60)
+    assert told(bench) == (FOLLOW, True, False, False, 0)
+    bench.setpoint(0.25)
+    assert told(bench) == (FOLLOW, True, False, False, 0)
+    state = bench.firmware.quiet_state()
+    assert state.state_number == STATE_NAMES.index("streaming")
+    assert (state.fresh_ns, state.now_ns, state.lifetime_ns) == (bench.now - MS, bench.now, 250 * MS)
+    assert (state.lease_until_ns, state.winding_c) == (bench.firmware.lease.until_ns, 154.0)
+    assert (state.targets[0], state.limited) == (0.25, 0)
+    assert bench.now < state.status_due_ns <= bench.now + 400 * MS
+    bench.winding_c = 155.0
+    bench.tick()
+    assert told(bench) == (FOLLOW, False, True, False, 0)
+
+
+@pytest.mark.parametrize(("action", "source"), [("motor_off", FOLLOW), ("hold", FOLLOW), ("damping", BRAKE)])
+def test_quiet_ticks_brake_after_an_expiry_that_damps(action: str, source: int) -> None:
+    bench = Bench(expiry_action=action)
+    bench.acquire()
+    bench.move(5)
+    bench.ticks(255)
+    assert bench.firmware.state == "expired"
+    assert told(bench) == (source, False, False, False, 0)
+    # A lease that is held again, by which nothing expires, has nothing to brake.
+    bench.acquire()
+    assert told(bench)[0] == FOLLOW
+
+
+@pytest.mark.parametrize(("m_stop", "source"), [(None, BRAKE), ("motor_off", FOLLOW)])
+def test_quiet_ticks_brake_while_stopped_unless_the_motor_is_to_be_off(
+    m_stop: str | None, source: int
+) -> None:
+    bench = Bench(safety=Safety(m_stop=m_stop))
+    bench.m_stop = True
+    bench.tick()
+    assert (bench.firmware.state, told(bench)[0]) == ("stopped", source)
+    bench.m_stop = False
+    bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="me"))
+    assert told(bench)[0] == BRAKE
