@@ -77,6 +77,9 @@ at_limit = ["disabled", "spring"]
         ("[module.A]\n\nposition_rad = [0.5, -0.5]\n", 3, ("module.A.position_rad", "0.5 .. -0.5", "below")),
         ("[default]\nposition_rad = [0.0, 1e9]\n", 2, ("default.position_rad", "inf")),
         ("[default]\neffort_nm = [1.0, 2.0]\n", 2, ("default.effort_nm", "1 .. 2")),
+        ("[default]\nposition_rad = [0.5, 0.5]\n", 2, ("default.position_rad", "0.5 .. 0.5", "below")),
+        ("[default]\neffort_nm = [-1.0, 0.0]\n", 2, ("default.effort_nm", "-1 .. 0", "below 0")),
+        ("[default]\neffort_nm = [0.0, 1.0]\n", 2, ("default.effort_nm", "0 .. 1", "below 0")),
         ("[default]\nat_limit = 'brake'\n", 2, ("default.at_limit", "motor_off")),
         ("[default]\nm_stop = 'spring'\n", 2, ("default.m_stop", "motor_off")),
         ("[default]\nbraking_rad_s2 = 0.0\n", 2, ("default.braking_rad_s2",)),
@@ -99,6 +102,12 @@ def test_a_mistake_in_toml_is_answered_with_line_and_key(
     assert str(caught.value).startswith(f"{path}:{line}: ")
     for word in words:
         assert word in str(caught.value)
+
+
+def test_a_joint_is_limited_to_a_hundred_thousand_radians_at_most() -> None:
+    assert Safety(position_rad=(-1e5, 1e5)).range_rad == (-1e5, 1e5)
+    with pytest.raises(ValueError, match="at most 100000, or inf for no limit"):
+        Safety(position_rad=(-1e5, math.nextafter(1e5, INF)))
 
 
 def test_an_agent_takes_a_file_of_the_whole_robot(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from module_agent.firmware.admission import NEVER_NS, SENDERS_REMEMBERED, Admission, Lease
-from module_agent.wire.codec import encode
+from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ask, LeaseRequest, Setpoint, Stop
 from module_agent.wire.proof import proven
@@ -217,6 +217,18 @@ def test_what_is_not_is_refused(leaf: Leaf, message: Any, refusal: Refusal, word
     with pytest.raises(WireError, match=words) as error:
         admission().read(leaf, encode(message))
     assert reason(error) is refusal
+
+
+def test_what_is_longer_than_its_topic_allows_is_not_even_unpacked() -> None:
+    for leaf, size, refusal in (
+        (Leaf.LEASE, MAX_COMMAND_BYTES, Refusal.MALFORMED),
+        (Leaf.LEASE, MAX_COMMAND_BYTES + 1, Refusal.TOO_LONG),
+        (Leaf.COLLECT, MAX_MESSAGE_BYTES, Refusal.MALFORMED),
+        (Leaf.COLLECT, MAX_MESSAGE_BYTES + 1, Refusal.TOO_LONG),
+    ):
+        with pytest.raises(WireError) as error:
+            admission().read(leaf, b"\xc1" * size)
+        assert reason(error) is refusal
 
 
 def test_refusals_are_counted_by_reason() -> None:

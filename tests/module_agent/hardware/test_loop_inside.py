@@ -7,7 +7,7 @@ import pytest
 
 from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
 from module_agent.control.gains import default_gains
-from module_agent.hardware.hardware import LimitState, ModuleSample, SensorSample
+from module_agent.hardware.hardware import LimitState, ModuleSample, Readings, SensorSample
 from module_agent.hardware.loop_inside import DEFAULT_LIFETIME_NS, LoopInside
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
 from module_agent.model.catalogue import CATALOGUE
@@ -125,6 +125,63 @@ def test_without_commands_the_loops_run_on_until_the_lifetime_is_over() -> None:
     pwm = [bench.receive().pwm for _ in range(lifetime + 4)]
     assert pwm == [0.9] * (lifetime + 1) + [0.0] * 3
     assert bench.drive(PUSH)[0] == 0.9
+
+
+def test_while_its_clock_stands_still_a_command_lives_and_when_it_goes_back_it_ends() -> None:
+    bench = Bench()
+    bench.receive()
+    bench.modules.send([PUSH])
+    for back_ns, pwm in ((MS, 0.9), (MS, 0.9), (MS + 1, 0.9), (0, 0.0)):
+        # What a module reads acts on the tick after it.
+        bench.now_ns -= back_ns
+        assert bench.receive().pwm == pwm
+
+
+def test_a_command_is_carried_out_once() -> None:
+    """Its integral is of the time that passes, and not of how often the loops are asked."""
+    bench = Bench()
+    gains = default_gains(CATALOGUE["SEA-snake"], 3)
+    integral = gains.position.model_copy(update={"ki": 50.0, "i_clamp": 1.0})
+    bench.modules.set_gains(0, gains.model_copy(update={"position": integral}))
+    for _ in range(3):
+        bench.receive()
+        (pwm,) = bench.modules.send([Command(0.1, NAN, NAN)])
+        assert bench.receive().pwm == bench.wires.pwm[-1] == pwm
+
+
+def test_samples_are_counted_and_so_are_those_of_quiet_ticks() -> None:
+    bench = Bench()
+    assert [bench.receive().sequence for _ in range(3)] == [1, 2, 3]
+    for _ in range(2):
+        bench.modules.exchange([0.0])
+    assert bench.receive().sequence == 6
+
+
+def test_readings_in_a_block_of_memory_are_handed_on_as_they_are() -> None:
+    bench = Bench()
+    bench.receive()
+    block = Readings.of([REST])
+    samples = bench.modules.exchange([0.0])
+    assert list(samples) == [bench.wires.sample]
+    bench.wires.exchange = lambda pwm: block  # type: ignore[method-assign]
+    assert bench.modules.exchange([0.0]) is block
+
+
+def test_a_module_goes_on_from_what_a_quiet_tick_has_left_of_it() -> None:
+    bench = Bench()
+    bench.drive(PUSH)
+    assert bench.modules.quiet_state(0)[1:5] == (True, True, 0, 0.9)
+    drive = bench.modules.quiet_state(0)
+    memory = [loop.memory for loop in drive.controller.loops]
+    last = REST._replace(t_ns=bench.now_ns, position_rad=0.7)
+    bench.drive(PUSH)
+    bench.modules.go_on(0, last, 0.3, False, 2, memory)
+    assert bench.modules.quiet_state(0)[1:5] == (True, False, 2, 0.3)
+    bench.modules.send([MOTOR_OFF])
+    bench.modules.go_on(0, last, 0.3, True, 2, memory)
+    sample = bench.receive(position_rad=NAN)
+    assert (sample.pwm, sample.limits, sample.sensors.position_rad) == (0.3, LimitState.VELOCITY, 0.7)
+    assert bench.wires.pwm[-1] == 0.3
 
 
 def test_before_the_first_command_the_motor_is_off() -> None:
