@@ -7,20 +7,40 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import ConnectOptions, Expect, Speed
+from coordinator.commands.options import ConnectOptions, Expect, JsonFile, Speed
 from coordinator.live_robot.connection import Connection, Place, new_sender, open_connection
 from coordinator.live_robot.discovery import AS_HUB_S, Search, described, light_led
 from coordinator.live_robot.short_session import ShortSession
-from coordinator.runtime.command_line import with_options
+from coordinator.monitoring.module_states import full_name
+from coordinator.runtime.command_line import in_a_folder, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
-from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.runtime.terminal import Terminal, new_table, print_table, write_result
 from module_agent.control.gains_file import read_gains, write_gains
-from module_agent.model.errors import RobotError
+from module_agent.model.errors import RobotError, UsageError
 from module_agent.wire.messages import Info
+
+_SHOWN = {"serial", "family", "name", "module_type", "gains"}
+
+
+def _distinct(serials: list[str] | None) -> list[str] | None:
+    if serials is not None and (twice := {one for one in serials if serials.count(one) > 1}):
+        raise UsageError(f"--module {', '.join(sorted(twice))}: is given twice")
+    return serials
+
+
+def _readable(file: Path) -> Path:
+    if not file.is_file():
+        raise UsageError(f"{file}: there is no such file")
+    return file
+
 
 Modules = Annotated[
     list[str] | None,
-    typer.Option("--module", help="Serial of a module; repeat in the order of the file [all, by serial]."),
+    typer.Option(
+        "--module",
+        help="Serial of a module; repeat in the order of the file [all, by serial].",
+        callback=_distinct,
+    ),
 ]
 
 gains = typer.Typer(
@@ -34,25 +54,28 @@ gains = typer.Typer(
 
 @gains.command("show")
 @with_options
-def show(at: ConnectOptions, expect: Expect = None, module: Modules = None) -> None:
+def show(
+    at: ConnectOptions, expect: Expect = None, module: Modules = None, json_file: JsonFile = None
+) -> None:
     """Show strategy and kp of position, velocity and effort of every module.
 
     Exit codes: 0 all answer, 1 a module does not answer or too few do, 2 wrong usage.
     """
     infos = _modules(at, expect, module)
+    if not write_result(json_file, [info.model_dump(include=_SHOWN) for info in infos]):
+        return
     table = new_table("gains", "serial | family/name | type | strategy | kp: position, velocity, effort")
     for info in infos:
         loops = (info.gains.position, info.gains.velocity, info.gains.effort)
         kp = ", ".join(f"{loop.kp:g}" for loop in loops)
-        name = f"{info.family}/{info.name}"
-        table.add_row(info.serial, name, info.module_type, str(info.gains.strategy), kp)
-    Terminal().console.print(table)
+        table.add_row(info.serial, full_name(info) or "-", info.module_type, str(info.gains.strategy), kp)
+    print_table(table)
 
 
 @gains.command("save")
 @with_options
 def save(
-    file: Annotated[Path, typer.Argument(help="File to write, XML.")],
+    file: Annotated[Path, typer.Argument(help="File to write, XML.", callback=in_a_folder)],
     at: ConnectOptions,
     expect: Expect = None,
     module: Modules = None,
@@ -69,7 +92,7 @@ def save(
 @gains.command("load")
 @with_options
 def load(
-    file: Annotated[Path, typer.Argument(help="Gains file, XML.")],
+    file: Annotated[Path, typer.Argument(help="Gains file, XML.", callback=_readable)],
     at: ConnectOptions,
     expect: Expect = None,
     module: Modules = None,

@@ -11,7 +11,8 @@ from coordinator.export.exported_run import ExportedRun, check_package, read_exp
 from coordinator.export.messages import write_messages
 from coordinator.export.tables import write_table
 from coordinator.runtime.command_line import in_a_folder
-from coordinator.runtime.terminal import Terminal
+from coordinator.runtime.terminal import STANDARD_OUTPUT, Terminal
+from module_agent.model.errors import UsageError
 from module_agent.model.files import replacing
 
 
@@ -24,10 +25,17 @@ class Format(StrEnum):
     FOXGLOVE = "foxglove"
 
 
+def _output_file(file: Path) -> Path:
+    if file == STANDARD_OUTPUT:
+        raise UsageError("--out -: a run is exported to a file; give its name")
+    in_a_folder(file)
+    return file
+
+
 def export(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, finished or not.")],
     to: Annotated[Format, typer.Option(help="Table (csv, parquet), or MCAP file (ros2, foxglove).")],
-    out: Annotated[Path, typer.Option(help="File to write.", callback=in_a_folder)],
+    out: Annotated[Path, typer.Option(help="File to write.", callback=_output_file)],
     rate_hz: Annotated[
         float | None,
         typer.Option(help="Interpolate all modules at so many common instants a second [every sample]."),

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from coordinator.live_robot.authority import DAYS, make_credentials
-from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.runtime.terminal import Terminal, new_table, print_table
 from module_agent.transport.credentials import AUTHORITY, COORDINATOR, FLEET, OBSERVER
 
 
@@ -38,6 +38,5 @@ def keys(
     table.add_row(OBSERVER, "read; stop", f"{OBSERVER}.pem, {OBSERVER}.key")
     table.add_row("everybody", "", f"{FLEET}, {AUTHORITY}.pem")
     table.add_row("-", "certify", f"{AUTHORITY}.key: keep it away from the robot")
-    terminal = Terminal()
-    terminal.console.print(table)
-    terminal.note(f"new: {', '.join(made.new) or 'nothing'}")
+    print_table(table)
+    Terminal().note(f"new: {', '.join(made.new) or 'nothing'}")

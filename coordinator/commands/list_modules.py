@@ -10,7 +10,7 @@ from coordinator.live_robot.discovery import AS_HUB_S, Listing, Search, listed, 
 from coordinator.monitoring.module_states import full_name
 from coordinator.recording.recording import Recording
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.terminal import Terminal, figure, new_table, write_result
+from coordinator.runtime.terminal import Terminal, figure, new_table, print_table, write_result
 from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Transport
@@ -29,7 +29,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
     delays = {one.serial: one for one in feedback_delays(found.recording)}
     rows = [_fields(status, found.recording, delays.get(status.serial)) for status in found.statuses]
     if write_result(json_file, rows):
-        Terminal().console.print(_table(place.robot, found, delays))
+        print_table(_table(place.robot, found, delays))
         if found.cpu_us_per_message is not None:
             Terminal(at.quiet).note(
                 f"{found.cpu_us_per_message:.0f} us of processor time a message received here"
@@ -45,10 +45,10 @@ def _fields(status: Status, recording: Recording, delay: FeedbackDelay | None) -
 
 
 def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> Table:
-    """Return the modules with the delay of their feedback from sample to here."""
+    """Return the modules with the delay of their feedback from sample to here, and how well that is known."""
     table = new_table(
         robot,
-        "serial | name | type | state | holder | >delay p50 [ms] | >p99 [ms] | expiries | limited by | "
+        "serial | name | type | state | holder | >delay p50 [ms] | >p99 [ms] | >+- | expiries | limited by | "
         "refused",
     )
     for status in found.statuses:
@@ -61,6 +61,7 @@ def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> T
             status.holder or "-",
             figure(delay and delay.p50_ms, ".1f"),
             figure(delay and delay.p99_ms, ".1f"),
+            figure(delay and delay.clock_sigma_ms, ".1f"),
             str(status.expiries),
             ", ".join(status.limits) or "-",
             ", ".join(f"{k} {v}" for k, v in status.refusals.items()) or "-",

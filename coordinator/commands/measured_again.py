@@ -7,7 +7,7 @@ import typer
 
 from coordinator.baseline.baseline_robot import BaselineRobot, load_baseline
 from coordinator.baseline.check import CheckReport, check, check_plan, write_check
-from coordinator.baseline.payload import PayloadError, payload_plan, search_payload, write_payload
+from coordinator.baseline.payload import payload_plan, search_payload, write_payload
 from coordinator.commands.options import (
     AgainOptions,
     BaselineFolder,
@@ -21,7 +21,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.live_robot.connection import new_sender
 from coordinator.recording.run_folder import RESULT
 from coordinator.runtime.command_line import end_if_suspect, with_options
-from coordinator.runtime.terminal import Terminal, new_table, write_result
+from coordinator.runtime.terminal import Terminal, new_table, print_table, write_result
 from coordinator.session.run import RunConfig
 from coordinator.torque_control.gravity_model import read_result
 from module_agent.model.errors import EXIT_FINDING, UsageError
@@ -66,7 +66,7 @@ def _print(report: CheckReport) -> None:
             "changed" if link.changed else "",
         )
     if report.links:
-        Terminal().console.print(table)
+        print_table(table)
     typer.echo("\n".join(report.summary))
 
 
@@ -80,7 +80,7 @@ def find_payload(
     """
     # Before the robot is moved, and before seconds of work.
     if (baseline / RESULT).is_file() and read_result(baseline).dynamics is None:
-        raise PayloadError(
+        raise UsageError(
             f"{baseline} has no inertia, since the run had --no-dynamics: a payload is what is more than a "
             "known inertia; identify the robot with dynamics first"
         )

@@ -11,7 +11,7 @@ from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Sp
 from coordinator.identification.identify import identify
 from coordinator.identification.result import DynamicsPart, Result
 from coordinator.live_robot.connection import Place, new_sender, open_connection
-from coordinator.recording.run_folder import REPORT, load_recording
+from coordinator.recording.run_folder import REPORT, SESSION, load_recording
 from coordinator.recording.session_file import SessionFileError
 from coordinator.report.plots import MissingPlots
 from coordinator.report.run_report import write_report
@@ -89,7 +89,7 @@ def run(
 
 
 def replay(
-    session: Annotated[Path, typer.Argument(help="A session.mcap.")],
+    session: Annotated[Path, typer.Argument(help="A session.mcap, or the folder of a run.")],
     out: Annotated[Path | None, typer.Option(help="Folder for result.json [folder of the session].")] = None,
     report: WithReport = True,
 ) -> None:
@@ -97,6 +97,9 @@ def replay(
 
     Exit codes: 5 sensors are sick or the recording is damaged, others as of `run`.
     """
+    session = session / SESSION if session.is_dir() else session
+    if not session.is_file():
+        raise UsageError(f"{session}: there is no such recording")
     folder = out if out is not None else session.parent
     recording, terminal = load_recording(session), Terminal()
     # Before anything is identified: where that fails this may be why.

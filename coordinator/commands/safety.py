@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.runtime.command_line import in_a_folder
+from coordinator.runtime.terminal import Terminal, new_table, print_table
 from module_agent.control.safety import Safety
 from module_agent.control.safety_file import read_safety, safety_toml, safety_xml
 from module_agent.model.errors import UsageError
@@ -25,7 +26,10 @@ def safety(
         list[str], typer.Argument(metavar="SERIAL...", help="The modules, in the order of an XML file.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Write the same limits to this file, .toml or .xml [only show them].")
+        Path | None,
+        typer.Option(
+            help="Write the same limits to this file, .toml or .xml [only show them].", callback=in_a_folder
+        ),
     ] = None,
 ) -> None:
     """Show the limits that a safety file gives to modules, and write them as TOML or as HEBI's XML.
@@ -33,6 +37,8 @@ def safety(
     `--safety FILE` on an agent enforces them. Exit codes: 0 the file is right, 2 it is not, or the other
     format cannot say what it says.
     """
+    if len(set(serials)) < len(serials):
+        raise UsageError(f"SERIAL... {' '.join(serials)}: a module is given twice")
     known = read_safety(file, serials)
     if out is not None:
         if out.suffix.lower() not in (".toml", ".xml"):
@@ -42,10 +48,9 @@ def safety(
     table = new_table(str(file), _COLUMNS)
     for serial, one in known.items():
         table.add_row(serial, *_shown(one))
-    terminal = Terminal()
-    terminal.console.print(table)
+    print_table(table)
     if out is not None:
-        terminal.note(f"written: {out}")
+        Terminal().note(f"written: {out}")
 
 
 def _shown(one: Safety) -> tuple[str, ...]:

@@ -21,11 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from coordinator.description.module_geometry import Module, placed_modules
 from coordinator.description.module_geometry import links as links_between
+from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import (
     Body,
     body,
     is_consistent,
     nearest_consistent,
+    parameters,
     pseudo_inertia,
     smallest_eigenvalue,
 )
@@ -55,8 +57,9 @@ def write_urdf(
 ) -> None:
     """Write the robot of n joints; the file is the complete old or the complete new one.
 
-    phi: (10 n,) inertial parameters as in `torque_regressor`, None to write no inertias. Parameters that are
-    no real body's are replaced by the nearest real body (`nearest_consistent`), and a comment says so.
+    phi: (10 n,) inertial parameters as in `torque_regressor`. With None those of the modules' make are
+        written, and a comment says so; without types none are. Parameters that are no real body's are
+        replaced by the nearest real body (`nearest_consistent`), and a comment says so.
     module_types: per joint; their limits and losses, frames and shapes are written.
     undetermined: by the serial, parameters of its body that torques alone do not determine; a comment in the
         link names them.
@@ -83,10 +86,17 @@ def robot_element(
     if module_types is not None and len(module_types) != joints:
         raise ValueError(f"{len(module_types)} module types for a chain of {joints} joints")
     bodies = None if phi is None else check_phi(chain, phi).reshape(joints, PER_BODY)
+    is_catalogues = bodies is None and module_types is not None
+    if is_catalogues and module_types is not None:
+        bodies = np.array([parameters(one) for one in module_prior(chain, module_types)])
     homes = link_homes(chain)
     names = {BASE: "base"} | {k: f"body_{serial}" for k, serial in enumerate(chain.serials)}
     robot = Element("robot", name=name)
     comment(robot, "Joint positions are the modules' own; every frame is where it is at q = 0. SI units.")
+    if is_catalogues:
+        comment(
+            robot, "Masses and inertias are the catalogue's of the modules' types; they are not identified."
+        )
     SubElement(robot, "link", name="world")
     links = {BASE: SubElement(robot, "link", name="base")}
     _joint(robot, "world_to_base", "fixed", "world", "base", upright_pose(chain.gravity))

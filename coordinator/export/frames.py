@@ -57,7 +57,10 @@ def instants_frame(run: ExportedRun, rate_hz: float) -> "DataFrame":
     for serial, signals in instants.signals.items():
         named = [(name, values) for name, values in _columns(signals) if name not in ("t_s", "imu_t_s")]
         columns |= {f"{serial}.{name}": values for name, values in named}
-        columns[f"{serial}.state"] = state_names(signals)
+        known = ~np.isnan(signals.position_rad)
+        # What counts or names has no NaN; where nothing is known it is not 0.
+        columns[f"{serial}.motion_id"] = pd.Series(signals.motion_id, dtype="Int64").where(known)
+        columns[f"{serial}.state"] = pd.Series(state_names(signals), dtype=object).where(known)
     return pd.DataFrame(columns)
 
 

@@ -37,9 +37,9 @@ def at_instants(signals: Mapping[str, Signals], rate_hz: float) -> Instants:
     """
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
         raise UsageError(f"{rate_hz} instants per second: between 0 and {MAX_RATE_HZ:g} are needed")
-    first = np.floor(min(each.t_s[0] for each in signals.values()) * rate_hz)
-    last = max(each.t_s[-1] for each in signals.values()) * rate_hz
     # Whole multiples of the period, so that runs and modules share the instants.
+    first = np.ceil(min(each.t_s[0] for each in signals.values()) * rate_hz)
+    last = np.floor(max(each.t_s[-1] for each in signals.values()) * rate_hz)
     t_s = np.arange(first, last + 1.0) / rate_hz
     return Instants(t_s, {serial: _interpolated(each, t_s) for serial, each in signals.items()})
 

@@ -54,10 +54,12 @@ def in_a_folder(file: Path | None) -> Path | None:
     """Check before the work that a file can be written at its end; for options that name one.
 
     Raises:
-        UsageError: its folder does not exist.
+        UsageError: its folder does not exist, or it is a folder.
     """
     if file is not None and not file.parent.is_dir():
         raise UsageError(f"{file}: there is no folder {file.parent}")
+    if file is not None and file.is_dir():
+        raise UsageError(f"{file}: is a folder; name the file to write")
     return file
 
 
@@ -107,7 +109,7 @@ def lazy_app(
                 command.epilog = f"Example: {example}"
             # Tools that only look at commands have no context.
             if ctx is not None:
-                _take_settings(command, ctx, repeated)
+                _take_settings(cmd_name, command, ctx, repeated)
             return command
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -152,7 +154,14 @@ def lazy_app(
         ] = "",
     ) -> None:
         context.obj = read_settings(os.environ, Path()) if context.obj is None else context.obj
-        log(log_level or os.environ.get(variable("log_level")) or context.obj.get("log_level", "warning"))
+        for source, level in (
+            ("--log-level", log_level),
+            (variable("log_level"), os.environ.get(variable("log_level"))),
+            ("log_level of x5.toml", context.obj.get("log_level")),
+        ):
+            if level:
+                log(level, source)
+                return
 
     return app
 
@@ -163,15 +172,17 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
-def log(level: str) -> None:
+def log(level: str, source: str = "--log-level") -> None:
     """Log to standard error from this level on; at `debug` and `info` Zenoh says what it does as well.
+
+    `source` is where the level was given.
 
     Raises:
         UsageError: there is no such level.
     """
     if level not in LOG_LEVELS:
         raise UsageError(
-            f"--log-level {level}: it must be one of {', '.join(LOG_LEVELS)}{did_you_mean(level, LOG_LEVELS)}"
+            f"{source} {level}: it must be one of {', '.join(LOG_LEVELS)}{did_you_mean(level, LOG_LEVELS)}"
         )
     if level != "warning":  # which is Python's own default
         logging.basicConfig(level=level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
@@ -179,15 +190,21 @@ def log(level: str) -> None:
         os.environ.setdefault("RUST_LOG", f"zenoh={level}")
 
 
-def _take_settings(command: Any, context: Any, names: Collection[str]) -> None:
+def _take_settings(name: str, command: Any, context: Any, names: Collection[str]) -> None:
     """Let the options of a command that repeat be settings: variables of the environment, or of the file."""
     settings = context.obj if context.obj is not None else read_settings(os.environ, Path())
     context.obj = settings
+    defaults = _defaults(command, settings, names)
+    context.default_map = {**(context.default_map or {}), name: defaults}
+
+
+def _defaults(command: Any, settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Return the settings of a command, of a group by its commands, and let its variables be settings."""
+    if commands := getattr(command, "commands", None):
+        return {name: _defaults(each, settings, names) for name, each in commands.items()}
     repeated = [p for p in command.params if p.param_type_name == "option" and p.name in names]
     for option in repeated:
         option.envvar = variable(option.name)
-    defaults = {option.name: settings[option.name] for option in repeated if option.name in settings}
-    context.default_map = {**(context.default_map or {}), command.name: defaults}
     invoke = command.invoke
 
     def invoke_by_rank(called: Any) -> Any:
@@ -197,6 +214,7 @@ def _take_settings(command: Any, context: Any, names: Collection[str]) -> None:
         return invoke(called)
 
     command.invoke = invoke_by_rank
+    return {option.name: settings[option.name] for option in repeated if option.name in settings}
 
 
 _RANKS = ("DEFAULT", "DEFAULT_MAP", "ENVIRONMENT", "COMMANDLINE")

@@ -6,7 +6,7 @@ import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from rich.console import Console
 from rich.live import Live
@@ -30,11 +30,13 @@ _MIN_PIPE_WIDTH = 150
 def new_table(title: str | None, columns: str, **appearance: Any) -> Table:
     """Return a table without rows; `columns` are separated by bars, `>` aligns one to the right.
 
-    Units may stand in brackets, which are markup to rich.
+    Units may stand in brackets, which are markup to rich. In a narrow terminal the first column, which names
+    things, stays whole, and the others are folded.
     """
     table = Table(title=escape(title) if title else None, **appearance)
-    for name in columns.split(" | "):
-        table.add_column(escape(name.lstrip(">")), justify="right" if name.startswith(">") else "left")
+    for place, name in enumerate(columns.split(" | ")):
+        side: Literal["left", "right"] = "right" if name.startswith(">") else "left"
+        table.add_column(escape(name.lstrip(">")), justify=side, overflow="fold", no_wrap=place == 0)
     return table
 
 

@@ -27,7 +27,7 @@ from coordinator.runtime.event_loop import Interruption, run_to_end
 from coordinator.synchronisation.feedback_delays import feedback_delays
 from coordinator.viewer.targets import ViewerTargets, viewer_choice
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
-from module_agent.model.errors import UsageError
+from module_agent.model.errors import EXIT_USAGE, UsageError
 from module_agent.transport.transport import Event, Liveness, Reply, Sample, Sink
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
@@ -352,6 +352,6 @@ def test_a_payload_is_refused_at_once_where_nothing_was_weighed(known_folder: An
     """Before the robot moves: no recording is read, no network joined, no folder made."""
     baseline = known_folder("thesis_171_horizontal", dynamics=None)
     done = CliRunner().invoke(app, ["payload", str(baseline), "--out", str(tmp_path / "new")])
-    assert done.exit_code == 1
+    assert done.exit_code == EXIT_USAGE
     assert "--no-dynamics: a payload is what is more than a known inertia" in done.output
     assert not (tmp_path / "new").exists()

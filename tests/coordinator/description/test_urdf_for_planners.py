@@ -11,6 +11,7 @@ from numpy.random import default_rng
 
 from coordinator.description.module_geometry import links, placed_modules
 from coordinator.description.urdf_writer import write_urdf
+from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.kinematics.frames import distal_homes, housing_homes, output_homes
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import BASE, Array, Chain
@@ -135,6 +136,19 @@ def test_mujoco_converts_it_to_the_same_robot(name: str, tmp_path: Path) -> None
     np.testing.assert_allclose(gravity, expected, atol=1e-5 * 9.81 * float(phi.reshape(-1, 10)[:, 0].sum()))
     assert np.abs(expected).max() > 0.1
     assert float(converted.body_mass.sum()) == pytest.approx(float(phi.reshape(-1, 10)[:, 0].sum()), rel=1e-5)
+
+
+def test_without_dynamics_bodies_are_those_of_the_modules_make_so_that_simulators_load_them(
+    tmp_path: Path,
+) -> None:
+    robot = load_robot("a2085_03")
+    chain, kinds = true_chain(robot), build_tree(robot).types
+    write_urdf(tmp_path / "robot.urdf", chain, None, module_types=kinds)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.urdf"))
+    assert float(model.body_mass.sum()) == pytest.approx(
+        float(sum(one[3, 3] for one in module_prior(chain, kinds))), rel=1e-6
+    )
+    assert "they are not identified" in (tmp_path / "robot.urdf").read_text()
 
 
 def test_joints_have_the_ends_and_losses_of_their_types(tmp_path: Path) -> None:

@@ -149,8 +149,11 @@ def test_at_common_instants_every_module_has_a_column(folder: Path) -> None:
         error = inside[f"{serial}.position_rad"] - positions(inside["t_s"].to_numpy())
         assert np.abs(error).max() < 1e-4
         assert set(inside[f"{serial}.state"]) == {"moving"}
-    # Before its first sample a module has no position.
+    # Before its first sample a module has no position, and no state either.
     assert np.isnan(frame[f"{ELBOW}.position_rad"].iloc[0])
+    assert frame[[f"{ELBOW}.state", f"{ELBOW}.motion_id"]].iloc[0].isna().all()
+    # Before the first one of any there is no instant.
+    assert frame[f"{SHOULDER}.position_rad"].notna().iloc[0]
 
 
 def constant(t_s: np.ndarray) -> Signals:

@@ -59,11 +59,20 @@ def meet(
     typer.echo(f"{robot} {listen} {connect} {secure}")
 
 
+people = typer.Typer(no_args_is_help=True)
+people.command("meet")(meet)
+
+
+@people.command("leave")
+def leave() -> None:
+    """Say goodbye."""
+
+
 APP = lazy_app(
     "program",
     "Test.",
     __name__,
-    {"count": ("count", "Count things."), "meet": ("meet", "Meet.")},
+    {"count": ("count", "Count things."), "meet": ("meet", "Meet."), "club": ("people", "People.")},
     {"count": "program count sheep --count 3"},
     aliases={"number": "count"},
 )
@@ -116,8 +125,8 @@ def test_a_mistyped_command_is_answered_with_the_nearest_one() -> None:
 # ---------------------------------------------------------------------- settings
 
 
-def met(*arguments: str) -> str:
-    done = CliRunner().invoke(APP, ["meet", *arguments])
+def met(*arguments: str, command: tuple[str, ...] = ("meet",)) -> str:
+    done = CliRunner().invoke(APP, [*command, *arguments])
     assert done.exit_code == 0, done.output
     return str(done.output).strip()
 
@@ -132,6 +141,29 @@ def test_what_repeats_comes_from_a_file_then_a_variable_then_the_command_line(
     monkeypatch.setenv("X5_CONNECT", "tcp/one:1 tcp/two:2")
     assert met() == "b tcp/here:1 ['tcp/one:1', 'tcp/two:2'] keys"
     assert met("--robot", "c") == "c tcp/here:1 ['tcp/one:1', 'tcp/two:2'] keys"
+
+
+def test_commands_of_a_group_have_the_same_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x5.toml").write_text('robot = "a"\nconnect = ["tcp/router:7"]\nsecure = "keys"\n')
+    assert met(command=("club", "meet")) == met()
+    monkeypatch.setenv("X5_ROBOT", "b")
+    assert met(command=("club", "meet")) == met() == "b tcp/here:1 ['tcp/router:7'] keys"
+    routed = met("--listen", "tcp/there:2", command=("club", "meet"))
+    assert routed == "b tcp/there:2 None keys"
+
+
+@pytest.mark.parametrize(
+    ("file", "variable", "words"),
+    [("", "wran", "X5_LOG_LEVEL wran"), ('log_level = "debgu"', "", "log_level of x5.toml debgu")],
+)
+def test_a_wrong_level_is_said_with_where_it_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, variable: str, words: str
+) -> None:
+    (tmp_path / "x5.toml").write_text(file)
+    monkeypatch.setenv("X5_LOG_LEVEL", variable)
+    done = CliRunner().invoke(APP, ["meet"])
+    assert done.exit_code == 2
+    assert words in done.output
 
 
 def test_an_endpoint_on_the_command_line_is_not_overruled_by_routers_of_the_file(tmp_path: Path) -> None:
