@@ -107,17 +107,28 @@ def link_loads(
         if not chain.reversed[i]:
             below += _weight(beyond, _place(chain, kinds, i, kinds[i].com_xyz), kinds[i].mass_kg)
         hinge = start + HINGE_SHARE * (end - start)
-        moment = below[1] - cross(hinge[:, None], below[0])
         along = (end - start) / max(length, 1e-9)
-        loads[i] = LinkLoad(hinge, along, length, *(_series(part, rate_hz) for part in (below[0], moment)))
+        about = np.stack([below[0], below[1] - cross(hinge[:, None], below[0])])
+        loads[i] = LinkLoad(hinge, along, length, *about)
         carried[parent] += below
-    return loads
+    return _with_derivatives(loads, rate_hz)
 
 
-def _series(values: Array, rate_hz: float) -> Array:
-    """Return values (3, m), their first and their second derivative, (3, 3, m)."""
-    first = differentiate(values.T, rate_hz)
-    return np.stack([values, first.T, differentiate(first, rate_hz).T])
+def _with_derivatives(loads: Sequence[LinkLoad | None], rate_hz: float) -> list[LinkLoad | None]:
+    """Return loads whose forces and moments, (3, m) so far, have their first two derivatives, too."""
+    known = [load for load in loads if load is not None]
+    if not known:
+        return list(loads)
+    # All signals at once: splines over the same instants share their factors.
+    values = np.stack([part for load in known for part in (load.force, load.moment)])
+    samples = values.shape[-1]
+    first = differentiate(values.reshape(-1, samples).T, rate_hz)
+    second = differentiate(first, rate_hz)
+    series = np.stack([values, *(one.T.reshape(values.shape) for one in (first, second))], axis=1)
+    each = iter(series.reshape(-1, 2, *series.shape[1:]))
+    return [
+        load and load._replace(**dict(zip(("force", "moment"), next(each), strict=True))) for load in loads
+    ]
 
 
 def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> list[LinkLoad | None]:
