@@ -39,9 +39,11 @@ from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 
 ITERATIONS = 20
-# The last step: a hundredth of a standard deviation along what the motions of joints resolve, 0.1 mrad or mm
-# along what only the base's motion does. Smaller steps cost time and tell nothing.
-CONVERGED_SIGMAS, CONVERGED_UNKNOWN = 0.01, 1e-4
+# The last step in standard deviations: smaller ones cost time and tell nothing.
+CONVERGED_SIGMAS = 0.03
+# Fits from which others start lack what those add, links that give or hinges in their places: how often they
+# step at most, and their last step.
+COARSE_ITERATIONS, COARSE_SIGMAS = 8, 0.1
 # Directions with a larger sigma (rad or m) count as unresolved: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
 # Largest step (rad, m) along directions that only the motion of the base resolves.
@@ -118,6 +120,8 @@ def refine_chain(
     flex: ComplianceJacobian | None = None,
     calibration: ImuCalibration | None = None,
     noise: Array | None = None,
+    begin: Refinement | None = None,
+    coarse: bool = False,
 ) -> Refinement:
     """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
 
@@ -129,6 +133,9 @@ def refine_chain(
         calibration: prior of the IMUs where some were measured before, in the order of the chain.
         noise: (2, k, n) noise of gyro and accelerometer in each of k motions, rms per axis, where it is
             known: residuals far beyond it are systematic.
+        begin: a former fit, from whose IMUs and compliances, the first of `flex`, this one starts; None for
+            the prior's.
+        coarse: whether another fit starts from this one, which need not be as accurate then.
 
     Raises:
         DataError: fewer samples than parameters.
@@ -143,29 +150,52 @@ def refine_chain(
     flex = flex if flex is not None else rigid(len(data.q_rad))
     carried = flex.carried._replace(twists=padded(flex.carried.twists))
     problem = Problem(data, flex._replace(carried=carried), before, before.information()[0])
-    state = State(chain, before.mean, np.zeros(len(flex.links)))
+    state = _start(problem, chain, begin)
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
-    for used in range(1, ITERATIONS + 1):
+    iterations, converged = (COARSE_ITERATIONS, COARSE_SIGMAS) if coarse else (ITERATIONS, CONVERGED_SIGMAS)
+    settled = False
+    for used in range(1, iterations + 1):
         expected = _expected(problem, state)
-        if used > 1:
+        if used > 1 or begin is not None:
             sigmas = [_spread(data, residual) for residual in expected.residuals]
-        normal = normal_equations(problem, state, expected, expected.still, sigmas)
-        step, spectrum = _solve(normal)
-        own = normal.own_step(step)
-        last = float(np.abs(spectrum.in_sigmas(step)).max(initial=0.0)) / CONVERGED_SIGMAS
-        if expected.shaken is not None and not spectrum.known.all():
-            unknown = _along_unknown(problem, state, expected, sigmas, spectrum)
-            last = max(last, float(np.abs(unknown).max()) / CONVERGED_UNKNOWN)
-            step[: len(unknown)] += unknown
-        state = _moved(problem, state, step, own)
-        if used > 2 and last < 1.0:
+        state, last, by_shaking = _stepped(problem, state, expected, sigmas, settled)
+        # The first two steps are by weights that are guessed, or of a state that is far off.
+        settled = used > 2 and by_shaking < converged
+        if settled and last < converged:
             break
-    return _concluded(problem, state, noise)
+    return _concluded(problem, state, noise, coarse)
 
 
-def _concluded(problem: Problem, state: State, noise: Array | None) -> Refinement:
-    """Return the estimate and what the residuals tell of it."""
+def _start(problem: Problem, chain: Chain, begin: Refinement | None) -> State:
+    """Return the state that the iteration starts from."""
+    compliance = np.zeros(len(problem.flex.links))
+    if begin is None:
+        return State(chain, problem.calibration.mean, compliance)
+    compliance[: len(begin.compliance)] = begin.compliance
+    return State(chain, begin.calibration.mean, compliance)
+
+
+def _stepped(
+    problem: Problem, state: State, expected: Expected, sigmas: Sequence[Array], settled: bool
+) -> tuple[State, float, float]:
+    """Return the state after one step, and the sizes of that step in standard deviations: along what the
+    motions of joints resolve, and along what the base's motion does, zero if that is `settled`.
+    """
+    normal = normal_equations(problem, state, expected, expected.still, sigmas)
+    poses, spectrum, through = _solve(normal)
+    size, by_shaking = float(np.abs(spectrum.in_sigmas(poses)).max(initial=0.0)), 0.0
+    if expected.shaken is not None and not spectrum.known.all() and not settled:
+        shaken = normal_equations(problem, state, expected, expected.shaken, sigmas)
+        unknown, by_shaking = _along_unknown(shaken, spectrum)
+        poses = poses + unknown
+    nuisance = through[:, -1] - through[:, :-1] @ poses
+    step = np.concatenate([np.zeros(6), poses, nuisance])
+    return _moved(problem, state, step, normal.own_step(step)), size, by_shaking
+
+
+def _concluded(problem: Problem, state: State, noise: Array | None, coarse: bool) -> Refinement:
+    """Return the estimate and what the residuals tell of it; if `coarse`, noise is not told apart."""
     data, expected = problem.data, _expected(problem, state)
     white = [_spread(data, residual) for residual in expected.residuals]
     # Systematic errors repeat with the motion: their samples are not independent.
@@ -182,7 +212,8 @@ def _concluded(problem: Problem, state: State, noise: Array | None) -> Refinemen
             for spread, size, wide in zip(white, noise, believed, strict=True)
         ]
     normal = normal_equations(problem, state, expected, expected.still, believed)
-    by_noise = _reduced(normal_equations(problem, state, expected, expected.still, white))[0]
+    told = normal if coarse else normal_equations(problem, state, expected, expected.still, white)
+    by_noise = _reduced(told)[0]
     rms = [_rms(residual) for residual in expected.residuals]
     refined = _report(problem, state, normal, by_noise, rms, white, scale)
     return refined._replace(columns=_columns(data, expected.residuals))
@@ -286,11 +317,9 @@ class _Spectrum(NamedTuple):
     def known(self) -> Mask:
         return self.sigmas <= UNKNOWN_ABOVE
 
-    def in_sigmas(self, step: Array) -> Array:
-        """Return a step of all poses (6 n) and more along what is known, in standard deviations."""
-        return np.asarray(
-            self.vectors[:, self.known].T @ step[6 : 6 + len(self.vectors)] / self.sigmas[self.known]
-        )
+    def in_sigmas(self, poses: Array) -> Array:
+        """Return a step of poses (6 n - 6) along what is known, in standard deviations."""
+        return np.asarray(self.vectors[:, self.known].T @ poses / self.sigmas[self.known])
 
 
 def _reduced(normal: NormalEquations) -> tuple[Array, Array, Array]:
@@ -301,30 +330,32 @@ def _reduced(normal: NormalEquations) -> tuple[Array, Array, Array]:
     return information, normal.pose_rhs - normal.cross @ through[:, -1], through
 
 
-def _solve(normal: NormalEquations) -> tuple[Array, _Spectrum]:
-    """Return the step of all poses (6 n), zero where unresolved, and of the nuisance; the spectrum."""
+def _solve(normal: NormalEquations) -> tuple[Array, _Spectrum, Array]:
+    """Return the step of the poses (6 n - 6), zero where unresolved; the spectrum; the elimination."""
     information, rhs, through = _reduced(normal)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     with np.errstate(divide="ignore"):
         sigmas = 1.0 / np.sqrt(np.maximum(values, 0.0))
     spectrum = _Spectrum(vectors[:, ::-1], sigmas[::-1])
     kept = spectrum.vectors[:, spectrum.known]
-    step = kept @ (spectrum.sigmas[spectrum.known] ** 2 * (kept.T @ rhs))
-    nuisance = through[:, -1] - through[:, :-1] @ step
-    return np.concatenate([np.zeros(6), step, nuisance]), spectrum
+    return kept @ (spectrum.sigmas[spectrum.known] ** 2 * (kept.T @ rhs)), spectrum, through
 
 
-def _along_unknown(
-    problem: Problem, state: State, expected: Expected, sigmas: Sequence[Array], spectrum: "_Spectrum"
-) -> Array:
-    """Return the step (6 n,) by the base's motion, along what the joints' motions do not resolve."""
-    assert expected.shaken is not None
+def _along_unknown(shaken: NormalEquations, spectrum: "_Spectrum") -> tuple[Array, float]:
+    """Return the step (6 n - 6,) by the base's motion, along what the joints' motions do not resolve.
+
+    With it comes its size in standard deviations. What the joints' motions resolve is eliminated from these
+    equations, whose derivatives are those on the moving base: the base's motion tells of it, too, but in
+    terms that hold the noise of the IMU on the base.
+    """
+    information, rhs, _ = _reduced(shaken)
     hidden = spectrum.vectors[:, ~spectrum.known]
-    unknown = np.concatenate([np.zeros((6, hidden.shape[1])), hidden])
-    normal = normal_equations(problem, state, expected, expected.shaken, sigmas, unknown)
-    information, rhs, _ = _reduced(normal)
-    step = np.linalg.solve(information + np.eye(len(rhs)) * MAX_STEP**-2.0, rhs)
-    return np.asarray(unknown @ np.clip(step, -MAX_STEP, MAX_STEP))
+    seen = spectrum.vectors[:, spectrum.known] * spectrum.sigmas[spectrum.known]
+    follows = np.linalg.solve(seen.T @ information @ seen, seen.T @ information @ hidden)
+    alone = hidden - seen @ follows
+    limited = alone.T @ information @ hidden + np.eye(hidden.shape[1]) * MAX_STEP**-2.0
+    amounts = np.clip(np.linalg.solve(limited, alone.T @ rhs), -MAX_STEP, MAX_STEP)
+    return hidden @ amounts, float(np.sqrt(amounts @ limited @ amounts))
 
 
 def _moved(problem: Problem, state: State, step: Array, own: Array) -> State:

@@ -102,8 +102,8 @@ class Eliminated(NamedTuple):
 class NormalEquations(NamedTuple):
     """Of poses, gravity and links, the IMUs' own parameters eliminated: blocks and right-hand sides.
 
-    pose: of the perturbations of all modules but the root, or along some directions of these. nuisance: of
-    gravity and the links. cross: between them. eliminated: how the IMUs' own follow.
+    pose: of the perturbations of all modules but the root. nuisance: of gravity and the links. cross: between
+    them. eliminated: how the IMUs' own follow.
     """
 
     pose: Array
@@ -131,16 +131,15 @@ class NormalEquations(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """The reduced system: poses, or directions (6 n, u) of them, gravity (3), links, right-hand side."""
+    """The reduced system: poses, gravity (3), links, right-hand side."""
 
     modules: int
     links: int
-    directions: Array | None
 
     @property
     def poses(self) -> int:
         """The number of columns of poses."""
-        return 6 * self.modules if self.directions is None else self.directions.shape[1]
+        return 6 * self.modules
 
     @property
     def width(self) -> int:
@@ -148,19 +147,10 @@ class _Layout(NamedTuple):
         return self.poses + 3 + self.links + 1
 
     def at(self, path: Path, seen: SeenDisplacements) -> Index:
-        """Return the columns that an IMU's readings depend on, in the order of `rows`."""
-        own = (6 * path.modules[:, None] + np.arange(6)).ravel()
-        poses = own if self.directions is None else np.arange(self.poses)
+        """Return the columns that an IMU's readings depend on, in the order of `weighted_slopes`."""
+        poses = (6 * path.modules[:, None] + np.arange(6)).ravel()
         gravity = self.poses + np.arange(3)
         return np.concatenate([poses, gravity, self.poses + 3 + seen.numbers, [self.width - 1]])
-
-    def rows(self, path: Path, slopes: Array) -> Array:
-        """Return slopes (6 k + ..., 6, m) by the poses of a path and all else, along the directions."""
-        if self.directions is None:
-            return slopes
-        ends = 6 * len(path.modules)
-        along = self.directions.reshape(self.modules, 6, -1)[path.modules].reshape(ends, -1)
-        return np.concatenate([np.tensordot(along.T, slopes[:ends], axes=1), slopes[ends:]])
 
 
 class _Share(NamedTuple):
@@ -180,16 +170,14 @@ def normal_equations(
     expected: Expected,
     motion: Motion,
     sigmas: Sequence[Array],
-    directions: Array | None = None,
 ) -> NormalEquations:
     """Return the weighted normal equations; the root stays.
 
     Args:
         motion: at which the derivatives are taken.
         sigmas: (k, n) of gyros and accelerometers in every motion.
-        directions: (6 n, u) perturbations of the poses that count; None for all of them.
     """
-    layout = _Layout(len(state.chain.serials), len(problem.flex.links), directions)
+    layout = _Layout(len(state.chain.serials), len(problem.flex.links))
     information = np.zeros((layout.width, layout.width))
     _add_prior(problem, state, information, layout.poses)
     prior_rhs = problem.known @ (problem.calibration.mean - state.own)[:, problem.free].ravel()
@@ -209,7 +197,7 @@ def normal_equations(
     if waiting:
         eliminated = [_eliminated(information, *_together(waiting, problem.known, layout.width))]
     whole = np.triu(information) + np.triu(information, 1).T
-    poses = slice(6 if directions is None else 0, layout.poses)
+    poses = slice(6, layout.poses)
     rest = slice(layout.poses, layout.width - 1)
     return NormalEquations(
         whole[poses, poses],
@@ -236,8 +224,8 @@ def _share(
     weight = 1.0 / np.stack([sigma[:, k] for sigma in sigmas])[:, motions]
     residual = np.concatenate([part[:, k] for part in expected.residuals], axis=1).T
     twists = problem.flex.carried.twists
-    whole, placed = weighted_slopes(path, motion, twists, seen, mixing(state.imus, k), weight, residual)
-    rows, size = layout.rows(path, whole), int(problem.free.sum())
+    rows, placed = weighted_slopes(path, motion, twists, seen, mixing(state.imus, k), weight, residual)
+    size = int(problem.free.sum())
     flat = rows.reshape(len(rows), -1)
     share = _Share(
         layout.at(path, seen),

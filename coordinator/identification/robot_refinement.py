@@ -74,18 +74,20 @@ def refine_checked(
     """Refine as `refine_robot`; what contradicts the catalogue is free, so that the claim covers it.
 
     The scales of `doubted` encoders are free in any case. If errors of IMUs or scales of encoders are
-    outliers, the chain is refined with all IMUs anywhere and all scales free. Those that are significant then
-    stay free in the fit that is returned.
+    outliers, the last fit is repeated with all IMUs anywhere and all scales free. Those that are significant
+    then stay free in the fit that is returned.
     """
     known = calibration if calibration is not None else catalogued(chain.serials, prior)
     count = len(chain.serials)
     suspects = Suspects((), tuple(doubted), np.zeros(count))
-    refined = refine_robot(chain, kinds, windows, prior, floor, known, suspects, noise)
+    fitted = _fitted(chain, kinds, windows, prior, floor, known, suspects, noise)
+    refined = fitted.refined
     if count == 1 or _outlier(refined, prior, known) < SUSPICIOUS:
         return refined, suspects
     everyone = tuple(range(count))
     freed = Suspects(everyone, everyone, suspects.scale)
-    free = refine_robot(refined.chain, kinds, windows, prior, floor, known, freed, noise)
+    anywhere = known.widened(everyone, ANYWHERE_M)
+    free = _with_encoders(fitted.last, fitted.data, prior, fitted.flex, anywhere, freed, noise, coarse=True)
     moved = free.placement - known.placement
     away = np.abs(moved / np.hypot(free.placement_sigma, known.placement_sigma))[:, 3:].max(axis=1)
     off = _scale_sigmas(free) > SIGNIFICANT
@@ -140,6 +142,29 @@ def refine_robot(
     Raises:
         DataError: as `refine_chain`.
     """
+    return _fitted(chain, kinds, windows, prior, floor, calibration, suspects, noise).refined
+
+
+class _Fitted(NamedTuple):
+    """A refined robot, and the last of its fits: estimate, samples, how readings change with the links."""
+
+    refined: Refinement
+    last: Refinement
+    data: SensorData
+    flex: ComplianceJacobian
+
+
+def _fitted(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    windows: Sequence[Window],
+    prior: ImuPrior,
+    floor: NoiseFloor | None,
+    calibration: ImuCalibration | None,
+    suspects: Suspects | None,
+    noise: Array | None,
+) -> _Fitted:
+    """Refine as `refine_robot`."""
     count = len(chain.serials)
     suspects = suspects or Suspects((), (), np.zeros(count))
     windows = [_rescaled(one, suspects.scale) for one in windows]
@@ -157,13 +182,13 @@ def refine_robot(
     if not giving.compliance.size:
         fine = thinned(parts, keep)
         flex = without_links(len(fine.q_rad))
-        rigid_links = _with_encoders(giving.chain, fine, prior, flex, known, suspects, noise)
-        return rigid_links._replace(late_s=late_s)
+        last = _with_encoders(giving, fine, prior, flex, known, suspects, noise)
+        return _Fitted(last._replace(late_s=late_s), last, fine, flex)
     # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
     flex = hinge_slopes(joined(loads, COARSE * keep), len(coarse.q_rad), giving.compliance)
     tested = Suspects((), tuple(range(count)), suspects.scale)
-    hinged = _with_encoders(giving.chain, coarse, prior, flex, known, tested)
+    hinged = _with_encoders(giving, coarse, prior, flex, known, tested, coarse=True)
     links = len(giving.compliance)
     moved, joints = hinged.compliance[links:], flex.links[:links:2]
     loads = with_hinges_moved(loads, joints, moved)
@@ -173,28 +198,32 @@ def refine_robot(
     fine = thinned(parts, keep)
     compliance = hinged.compliance[:links]
     flex = hinge_slopes(joined(loads, keep), len(fine.q_rad), compliance, moved)
-    refined = _with_encoders(hinged.chain, fine, prior, flex, known, suspects, noise)
+    # The hinges' places are in the loads already.
+    begin = hinged._replace(compliance=compliance)
+    last = _with_encoders(begin, fine, prior, flex, known, suspects, noise)
+    # The last step estimates the change of the hinges' positions.
+    refined = last._replace(compliance=frozen(last.compliance + flex.taken), late_s=late_s)
     if not suspects.encoders:
         refined = refined._replace(
             encoder_scale=hinged.encoder_scale, encoder_scale_sigma=hinged.encoder_scale_sigma
         )
-    # The last step estimates the change of the hinges' positions.
-    return refined._replace(compliance=frozen(refined.compliance + flex.taken), late_s=late_s)
+    return _Fitted(refined, last, fine, flex)
 
 
 def _with_encoders(
-    chain: Chain,
+    begin: Refinement,
     data: SensorData,
     prior: ImuPrior,
     flex: ComplianceJacobian,
     calibration: ImuCalibration,
     suspects: Suspects,
     noise: Array | None = None,
+    coarse: bool = False,
 ) -> Refinement:
     """Refine with the scales of suspected encoders free, which are taken out of the compliances."""
     links = len(flex.links)
-    flex = with_encoder_scales(flex, chain, data.smooth, suspects.encoders)
-    refined = refine_chain(chain, data, prior, flex, calibration, noise)
+    flex = with_encoder_scales(flex, begin.chain, data.smooth, suspects.encoders)
+    refined = refine_chain(begin.chain, data, prior, flex, calibration, noise, begin, coarse)
     scale, sigma = suspects.scale.copy(), np.zeros(len(suspects.scale))
     scale[list(suspects.encoders)] += refined.compliance[links:]
     sigma[list(suspects.encoders)] = refined.compliance_sigma[links:]
@@ -220,12 +249,13 @@ def _giving(
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
     flex = compliance_jacobian(loads, len(resting.q_rad))
-    at_rest = refine_chain(rigid.chain, resting, prior, flex, calibration)
+    at_rest = refine_chain(rigid.chain, resting, prior, flex, calibration, coarse=True)
     data = thinned(parts, keep)
     single_module = len(rigid.chain.serials) == 1
     if data.base_motion is None or not data.base_motion.any() or single_module:
         return at_rest, still
-    shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex, calibration)
+    facing = faced(rigid.chain, data, rigid.estimate.null_basis)
+    shaken = refine_chain(facing, data, prior, flex, calibration, begin=at_rest, coarse=True)
     return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) - MIN_SHAKING else (at_rest, still)
 
 

@@ -135,18 +135,3 @@ def test_equations_by_paths_are_those_of_the_whole_jacobian(
     spread = np.linalg.inv(np.eye(own) + np.outer(step, step))
     by_others = np.linalg.inv(information[own:, own:]) + through[:, :-1] @ spread @ through[:, :-1].T
     _close(found.own_covariance(spread), by_others, 1e-9)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_equations_along_some_directions_are_the_projected_ones(robots: Any, seed: int) -> None:
-    problem, state, motion = _problem(robots, seed, 5, False)
-    sigmas = [np.full((3, 5), 0.02), np.full((3, 5), 0.1)]
-    expected, _ = _at(problem, state, motion)
-    whole = normal_equations(problem, state, expected, expected.still, sigmas)
-    along = np.linalg.qr(np.random.default_rng(seed).normal(size=(30, 3)))[0]
-    along[:6] = 0.0
-    found = normal_equations(problem, state, expected, expected.still, sigmas, along)
-    _close(found.pose, along[6:].T @ whole.pose @ along[6:])
-    _close(found.cross, along[6:].T @ whole.cross)
-    _close(found.nuisance, whole.nuisance)
-    _close(found.pose_rhs, along[6:].T @ whole.pose_rhs)

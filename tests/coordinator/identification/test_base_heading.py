@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from coordinator.batch_estimation.estimator import refine_chain
+from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.sensor_data import BaseMotion, SensorData, outstanding
 from coordinator.identification.robot_refinement import faced
@@ -127,6 +127,34 @@ def test_a_shaking_base_shows_the_heading_that_gravity_hides(robots: Any, headin
     settled = refine_chain(found, data, BIASES_ONLY)
     left = Rotation.from_matrix(settled.chain.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
     assert left.magnitude() < np.radians(0.1)
+
+
+def _far_sigmas(found: Refinement, other: Refinement) -> float:
+    """How far two fits are apart in standard deviations, along what both know."""
+    values, vectors = np.linalg.eigh(found.estimate.covariance)
+    kept = values > values.max() * 1e-12
+    apart = vectors[:, kept].T @ _apart(other.chain, found.chain).ravel()
+    return float(np.abs(apart / np.sqrt(values[kept])).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fit_on_a_shaking_base_ends_where_further_steps_do_not_lead_away(
+    shaken: tuple[Chain, SensorData], seed: int
+) -> None:
+    chain, data = shaken
+    off = np.random.default_rng(seed).normal(0.0, 0.01, (3, 6))
+    off[0] = 0.0
+    found = refine_chain(apply_perturbation(chain, off.ravel()), data)
+    further = refine_chain(found.chain, data, begin=found)
+    # The last step is below 0.03, and what is left of it is not much more.
+    assert _far_sigmas(found, further) < 0.06
+    hidden = found.estimate.null_basis.T @ _apart(further.chain, found.chain).ravel()
+    assert np.abs(hidden).max() < 1e-3
+    # Another fit may start from a coarse one.
+    coarse = refine_chain(apply_perturbation(chain, off.ravel()), data, coarse=True)
+    assert _far_sigmas(found, coarse) < 0.3
+    from_coarse = refine_chain(coarse.chain, data, begin=coarse)
+    assert _far_sigmas(found, from_coarse) < 0.06
 
 
 def test_without_base_motion_no_heading_is_touched(shaken: tuple[Chain, SensorData]) -> None:
