@@ -11,6 +11,8 @@ QUEUE_LENGTH = 8192
 # Places reserved for steps, topology and chain when there is too much data.
 RESERVED = 512
 IDLE_SECONDS = 0.25
+# A job that takes longer never ends: the library waits for a disk that is full, or for a viewer that is gone.
+PATIENCE_SECONDS = 20.0
 
 Job = Callable[[], None]
 
@@ -27,11 +29,17 @@ class LoggingThread:
         length: int = QUEUE_LENGTH,
         reserved: int = RESERVED,
         waits: bool = False,
+        patience_s: float = PATIENCE_SECONDS,
     ) -> None:
         """Start the thread; `on_idle` runs in it whenever there was no job for a while, `on_end` at the end.
 
-        With `waits`, `submit` waits for a place instead of dropping the job: for virtual time.
+        With `waits`, `submit` waits for a place instead of dropping the job: for virtual time. A job that
+        takes longer than `patience_s` is taken to hang, and the thread given up.
         """
+        self._patience_s = patience_s
+        self._hangs = False
+        # Jobs that have ended.
+        self._ended = 0
         self._waits = waits
         self._jobs: queue.Queue[Job | None] = queue.Queue(length + reserved)
         self._length = length
@@ -52,11 +60,12 @@ class LoggingThread:
     def submit(self, job: Job, *, essential: bool = False) -> bool:
         """Queue a job and return at once; False if it was dropped. Only essential jobs take reserved places.
 
-        A thread that waits drops nothing.
+        A thread that waits drops nothing, unless a job hangs.
         """
         if self._waits:
-            self._jobs.put(job)
-            return True
+            kept = self._put(job)
+            self.dropped += not kept
+            return kept
         try:
             if not essential and self._jobs.qsize() >= self._length:
                 raise queue.Full
@@ -66,12 +75,27 @@ class LoggingThread:
             return False
         return True
 
-    def close(self) -> None:
-        """Run what is queued, then end the thread. May be called twice."""
+    def close(self) -> bool:
+        """Run what is queued, then end the thread; False if a job hangs. May be called twice."""
         if not self._closed:
             self._closed = True
-            self._jobs.put(None)
-        self._thread.join()
+            self._put(None)
+        while self._thread.is_alive() and not self._hangs:
+            ended = self._ended
+            self._thread.join(self._patience_s)
+            self._hangs = self._thread.is_alive() and self._ended == ended
+        return not self._hangs
+
+    def _put(self, job: Job | None) -> bool:
+        """Queue a job as soon as there is a place; False if none comes, as one before it hangs."""
+        while not self._hangs:
+            ended = self._ended
+            try:
+                self._jobs.put(job, timeout=self._patience_s)
+                return True
+            except queue.Full:
+                self._hangs = self._ended == ended
+        return False
 
     def _run(self) -> None:
         while True:
@@ -94,3 +118,4 @@ class LoggingThread:
             self._failures[kind] = self._failures.get(kind, 0) + 1
             if self._failures[kind] == 1:
                 logger.exception("the viewer could not log something")
+        self._ended += 1

@@ -4,6 +4,7 @@ Rerun is imported when a viewer with a target is made, not with this module.
 """
 
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from coordinator.viewer.recorder import Recorder
 
 FLUSH_SECONDS = 5.0
+# To disconnect from both streams, each of which is flushed before.
+DISCONNECT_SECONDS = 20.0
 
 logger = logging.getLogger(__name__)
 
@@ -185,15 +188,39 @@ class Viewer:
         self._submit(lambda recorder: recorder.result(t_ns, markdown))
 
     def close(self) -> None:
-        """Write what is queued, complete the file and disconnect from live viewers. May be called twice."""
+        """Write what is queued, complete the file and disconnect from live viewers. May be called twice.
+
+        What hangs, as the library does on some full disks, is given up and reported.
+        """
         if self._closed:
             return
         self._closed = True
-        if self._thread is not None:
-            self._thread.close()
-            if self.dropped:
-                logger.warning("%d batches were dropped: they came faster than the viewer logs", self.dropped)
-            self._disconnect()
+        if self._thread is None:
+            return
+        complete = self._thread.close()
+        if self.dropped:
+            logger.warning("%d batches were dropped: they came faster than the viewer logs", self.dropped)
+        complete = complete and _ends_within(DISCONNECT_SECONDS, self._disconnect)
+        if self._opened.web_server is not None:
+            viewer_process.stop(self._opened.web_server)
+        # A stream has threads until nothing refers to it and it is cleaned up.
+        self._recorders, self._opened = (), Opened()
+        if complete:
+            from rerun_bindings import flush_and_cleanup_orphaned_recordings
+
+            flush_and_cleanup_orphaned_recordings()
+        else:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """Report a library that hangs, and let it not be waited for as the process ends."""
+        import rerun as rr
+
+        logger.error(
+            "the view of the run is not complete: the viewer's library does not end, as on some full disks; "
+            "the recording itself, session.mcap, is another file and has what was recorded"
+        )
+        rr.unregister_shutdown()
 
     def _disconnect(self) -> None:
         for stream in (self._opened.file, self._opened.live):
@@ -204,14 +231,6 @@ class Viewer:
                     # The file has its own stream and is complete; only the live viewer was lost.
                     logger.warning("a live viewer did not receive everything: %s", failure)
                 stream.disconnect()
-        if self._opened.web_server is not None:
-            viewer_process.stop(self._opened.web_server)
-        from rerun_bindings import flush_and_cleanup_orphaned_recordings
-
-        # A stream has threads until nothing refers to it and it is cleaned up.
-        self._recorders, self._opened = (), Opened()
-        del stream
-        flush_and_cleanup_orphaned_recordings()
 
     def _submit(self, log: "Callable[[Recorder], None]", *, essential: bool = True) -> None:
         """Queue a call to every recorder, each as a job of its own: one may fail without the other."""
@@ -225,3 +244,11 @@ class Viewer:
     def _all(self, log: "Callable[[Recorder], None]") -> None:
         for recorder in self._recorders:
             log(recorder)
+
+
+def _ends_within(seconds: float, work: Callable[[], None]) -> bool:
+    """Run something in a thread, which is left alone if it takes longer; return whether it ended."""
+    thread = threading.Thread(target=work, name="viewer's end", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()

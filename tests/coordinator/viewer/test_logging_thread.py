@@ -91,3 +91,35 @@ def test_closing_twice_ends_once() -> None:
     thread.close()
     thread.close()
     assert ended == ["end"]
+
+
+def test_a_job_that_hangs_is_given_up(gate: threading.Event) -> None:
+    begun = threading.Event()
+
+    def hang() -> None:
+        begun.set()
+        gate.wait()
+
+    thread = LoggingThread(nothing, nothing, length=1, reserved=0, waits=True, patience_s=0.05)
+    thread.submit(hang)
+    assert begun.wait(10.0)
+    assert thread.submit(nothing)
+    # In virtual time one waits for a place, as long as there is hope.
+    assert not thread.submit(nothing)
+    assert thread.dropped == 1
+    assert not thread.close()
+    gate.set()
+
+
+def test_a_queue_that_takes_long_in_all_is_no_job_that_hangs() -> None:
+    ran: list[int] = []
+    thread = LoggingThread(nothing, nothing, patience_s=0.5)
+
+    def slow() -> None:
+        threading.Event().wait(0.05)
+        ran.append(1)
+
+    for _ in range(20):
+        thread.submit(slow)
+    assert thread.close()
+    assert len(ran) == 20

@@ -1,5 +1,6 @@
 """The file that a viewer writes, read back with Rerun's own reader."""
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -300,6 +301,23 @@ def test_viewers_one_after_the_other_leave_no_threads_behind(tmp_path: Path, mak
         done(viewer)
         counts.append(threads())
     assert counts[1:] == counts[:1] * 3
+
+
+def test_a_library_that_hangs_at_the_end_is_given_up_and_named(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As it does on some full disks: the run ends all the same, and its process too."""
+    gate = threading.Event()
+    monkeypatch.setattr("coordinator.viewer.viewer.DISCONNECT_SECONDS", 0.05)
+    monkeypatch.setattr(rr.RecordingStream, "disconnect", lambda stream: gate.wait())
+    unregistered: list[bool] = []
+    monkeypatch.setattr(rr, "unregister_shutdown", lambda: unregistered.append(True))
+    viewer.phase(0, "rest")
+    viewer.close()
+    assert "the view of the run is not complete" in caplog.text
+    assert unregistered == [True]
+    monkeypatch.undo()
+    gate.set()
 
 
 def test_a_module_without_a_type_is_reported_and_the_run_goes_on(
