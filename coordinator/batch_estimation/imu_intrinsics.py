@@ -21,6 +21,14 @@ Index = NDArray[np.int64]
 SIZE = 34
 _GYRO, _ACCEL, DELAY, _FORCE = slice(0, 9), slice(9, 18), 24, slice(25, 34)
 GYRO_BIAS, ACCEL_BIAS = slice(18, 21), slice(21, 24)
+_NAMES = (
+    (_GYRO, "an error of its gyro's scale or axes", ""),
+    (_ACCEL, "an error of its accelerometer's scale or axes", ""),
+    (GYRO_BIAS, "the bias of its gyro", "rad/s"),
+    (ACCEL_BIAS, "the bias of its accelerometer", "m/s^2"),
+    (slice(DELAY, DELAY + 1), "the delay of its IMU", "s"),
+    (_FORCE, "the answer of its gyro to a specific force", "s/m"),
+)
 
 
 class ImuIntrinsics(NamedTuple):
@@ -58,6 +66,11 @@ def beyond(intrinsics: ImuIntrinsics, prior: ImuPrior) -> Array:
     """Return the largest error of every IMU (n,) in standard deviations of the prior."""
     free = prior.sigmas > 0.0
     return np.asarray(np.abs(intrinsics.errors[:, free] / prior.sigmas[free]).max(axis=1))
+
+
+def error_name(index: int) -> tuple[str, str]:
+    """Return what an element of an IMU's errors belongs to, as a phrase, and its unit."""
+    return next((name, unit) for part, name, unit in _NAMES if part.start <= index < part.stop)
 
 
 def perfect(count: int) -> ImuIntrinsics:

@@ -14,6 +14,7 @@ Sickness = Literal[
     "accelerometer_saturated",
     "accelerometer_contradicts",
     "imu_place",
+    "imu_error",
     "encoder_stuck",
     "encoder_jump",
     "encoder_sign",

@@ -40,6 +40,7 @@ from coordinator.identification.sensor_checks import (
     encoder_signs,
     encoder_travels,
     misfits,
+    poor_imus,
 )
 from coordinator.identification.signal_checks import sensor_findings, unusable
 from coordinator.identification.topology_observations import respond, simultaneous_motion
@@ -308,6 +309,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
             *opposed,
             *(one for one in geared.findings if one.serial not in {other.serial for other in doubted}),
             *doubted,
+            *poor_imus(refined, prior),
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
         )
     except DataError as error:

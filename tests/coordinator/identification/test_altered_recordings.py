@@ -22,6 +22,7 @@ from sim.benchmark.sick_recordings import (
     dead,
     jumped,
     leaping_clock,
+    multiplied,
     not_a_number,
     saturated,
     silent,
@@ -206,6 +207,14 @@ def test_a_sick_module_is_named_and_the_robot_identified_without_it(run: list[En
     # The link between the others is as it would be without the elbow, and its claim holds.
     assert found.result.serials == [YAW, LIFT]
     _covered(found.kinematics)
+
+
+def test_an_accelerometer_of_another_scale_ends_with_its_name(run: list[Entry]) -> None:
+    """The fit takes 5 % for a bias, and the link for 17 mm longer: the bias is what no calibrated IMU has."""
+    found = identify(_sick(run, multiplied(("accel_m_s2",), 1.05), ELBOW))
+    (finding,) = [one for one in found.result.sensors if one.kind == "imu_error" and one.serial == ELBOW]
+    assert finding.serious
+    assert any(ELBOW in sentence for sentence in found.result.suspicions)
 
 
 def test_readings_that_are_no_numbers_are_counted_and_the_others_used(run: list[Entry]) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.imu_intrinsics import ACCEL_BIAS, ImuIntrinsics, error_name
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.finding import SensorError
@@ -17,10 +18,12 @@ from coordinator.identification.sensor_checks import (
     effort_signs,
     encoder_signs,
     misfits,
+    poor_imus,
 )
 from coordinator.topology.topology import MotionObservation
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
 
@@ -119,3 +122,41 @@ def test_residuals_far_beyond_the_noise_are_named_by_serial_and_motion() -> None
     assert (finding.measured, finding.expected) == (pytest.approx(6e-3), pytest.approx(2e-4))
     text = "B: the residual of its gyro is 0.006 rad/s in the slow motion of A, 0.0002 rad/s is expected (29 "
     assert finding.summary.startswith(text)
+
+
+@pytest.mark.parametrize(("sensor", "kind"), [(0, "gyro_contradicts"), (1, "accelerometer_contradicts")])
+@pytest.mark.parametrize(("left", "serious"), [(0.2, False), (0.4, True)])
+def test_an_imu_most_of_which_is_unexplained_is_sick_whatever_gives(
+    sensor: int, kind: str, left: float, serious: bool
+) -> None:
+    """Links that bend leave a fifth at the most; the IMU of another module leaves half."""
+    noise = np.stack([np.full((2, 2), 2e-4), np.full((2, 2), 3e-3)])
+    read = np.zeros((2, 2, 2, 3))
+    # The first IMU is on the base and reads nothing; the second one half of it all in the first motion.
+    read[:, 0, 1], read[:, 1, 1] = 0.5, 0.1
+    residual = np.full(read.shape, 1e-4)
+    residual[sensor, 0, 1] = left * read[sensor, 0, 1]
+    columns = np.stack([residual, read], axis=1)
+    refined: Any = SimpleNamespace(
+        chain=SimpleNamespace(serials=("A", "B")), residuals=residual.max(axis=-1), columns=columns
+    )
+    (finding,) = misfits(refined, noise, ["the fast motion of A", "the slow motion of A"])
+    assert (finding.serial, finding.kind, finding.serious) == ("B", kind, serious)
+
+
+def test_an_imu_whose_errors_no_make_has_is_named() -> None:
+    errors = np.zeros((3, 34))
+    # Of calibrated IMUs 0.02 m/s^2 are usual: 7 sigmas may be links that give, 16 are not.
+    errors[1, ACCEL_BIAS], errors[2, ACCEL_BIAS] = 0.14, (0.1, -0.318, 0.0)
+    refined: Any = SimpleNamespace(
+        chain=SimpleNamespace(serials=("A", "B", "C")), intrinsics=ImuIntrinsics(errors)
+    )
+    (finding,) = poor_imus(refined, CALIBRATED)
+    assert (finding.serial, finding.kind, finding.serious) == ("C", "imu_error", True)
+    assert finding.summary.startswith("C: the bias of its accelerometer is -0.318 m/s^2 in its exploration")
+    # As delivered, 0.2 m/s^2 are usual.
+    assert poor_imus(refined, UNCALIBRATED) == []
+
+
+def test_every_error_of_an_imu_has_a_name() -> None:
+    assert len({error_name(index) for index in range(34)}) == 6
