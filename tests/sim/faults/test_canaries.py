@@ -14,11 +14,8 @@ from coordinator.identification.result import Result, write_result
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.session_file import SessionWriter
 from coordinator.session.session import Session
-from module_agent.control.gains import default_gains
 from module_agent.firmware.firmware import Answer, Firmware
 from module_agent.hardware.motor_guard import MotorGuard
-from module_agent.model.catalogue import ModuleType
-from module_agent.wire.messages import GainSet
 from sim.faults import run
 from sim.faults.report import run_seed
 from sim.faults.schedule import draw
@@ -36,8 +33,8 @@ FROZEN = 94
 STOLEN = 81
 # Messages are corrupted while joints move.
 CORRUPTED = 10
-# An encoder jumps while its joint holds its place.
-JUMPED = 30
+# Something holds a motor while its joint is to move, and lets it go.
+HELD = 39
 # Some messages arrive twice, which changes nothing.
 HARMLESS = 102
 
@@ -75,17 +72,11 @@ def test_a_coordinator_that_mixes_up_its_modules_misnames_the_cause(monkeypatch:
     assert run_seed(draw(FROZEN)).outcome == "misnamed"
 
 
-def test_loops_without_a_clamp_move_a_joint_beyond_the_limit_of_its_type(
+def test_a_guard_that_does_not_bound_the_speed_lets_a_motor_be_too_fast(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def unclamped(kind: ModuleType, strategy: int) -> GainSet:
-        gains = default_gains(kind, strategy)
-        position = gains.position.model_copy(update={"kp": 20.0, "max_output": 1e3, "min_output": -1e3})
-        velocity = gains.velocity.model_copy(update={"min_target": -1e3, "max_target": 1e3})
-        return gains.model_copy(update={"position": position, "velocity": velocity})
-
-    monkeypatch.setattr("module_agent.firmware.firmware.default_gains", unclamped)
-    assert "speed beyond the limit" in found(JUMPED)
+    monkeypatch.setattr("module_agent.hardware.motor_guard.OVERSPEED", 10.0)
+    assert set(found(HELD)) == {"speed beyond the limit"}
 
 
 def test_an_agent_that_dies_of_a_message_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:

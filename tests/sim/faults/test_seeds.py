@@ -10,7 +10,7 @@ from sim.faults.schedule import draw
 SEEDS = (
     *(4, 5, 6, 9, 13, 15, 16, 27, 37, 42, 45, 59, 63, 65, 73, 81, 86, 107, 110, 111),
     *(1012, 1024, 1034, 1039, 1041, 1060, 1064, 1114, 12),
-    # Found by the search, and mended: motors too fast, a brake taken for drive, IMUs exchanged in mid session.
+    # Found by the search, and mended: motors too fast, a brake taken for drive, IMUs exchanged.
     *(19, 39, 24, 2006, 3037),
 )
 
