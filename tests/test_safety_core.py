@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.safety_core import Mutant, changes_words_only, core, explained
+from tests.safety_core import Mutant, changes_words_only, core, explained, makes_zip_loose
 
 ROOT = Path(__file__).parents[1]
 
@@ -40,3 +40,20 @@ def test_a_change_of_words_is_one_of_a_sentence_and_of_nothing_else(
     was: str, becomes: str, words: bool
 ) -> None:
     assert changes_words_only(Mutant("a.b", was, becomes)) is words
+
+
+@pytest.mark.parametrize(
+    ("becomes", "loose"),
+    [
+        ("for a, b in zip(f(x), y, strict=None):", True),
+        ("for a, b in zip(f(x), y, strict=False):", True),
+        ("for a, b in zip(f(x), y, ):", True),
+        ("for a, b in zip(f(x), strict=True):", False),
+        ("for a, b in zip(f(x), None, strict=True):", False),
+        ("for a, b in zip(f(None), y, strict=True):", False),
+    ],
+)
+def test_a_zip_that_is_loose_is_one_that_lost_its_strictness_and_nothing_else(
+    becomes: str, loose: bool
+) -> None:
+    assert makes_zip_loose(Mutant("a.b", "for a, b in zip(f(x), y, strict=True):", becomes)) is loose
