@@ -892,6 +892,8 @@ def test_a_fresh_module_has_nothing_to_say() -> None:
     status = bench.status()
     assert (status.dropped_events, status.expiries, status.refusals, status.note) == (0, 0, {}, "")
     assert (status.motion, bench.firmware.last_rest) == (None, None)
+    (first,) = [decode(Status, o.payload) for o in bench.published if o.leaf is Leaf.STATUS]
+    assert (first.limits, first.note) == ((), "")
     bench.acquire()
     assert bench.status().note == ""
 

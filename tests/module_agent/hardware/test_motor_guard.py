@@ -321,6 +321,9 @@ def test_exactly_at_its_ceiling_a_pwm_is_not_limited(sign: float) -> None:
 def test_without_a_supply_and_with_one_that_reads_below_zero_there_is_no_pwm(pwm: float) -> None:
     for voltage_v in (0.0, -24.0):
         assert driven(guard(), pwm, reading(voltage_v=voltage_v))[0] == 0.0
+    # As little as there is, is used.
+    some = math.copysign((1.0 - 1.0 / 115.0) * 0.5 / 48.0, pwm) if pwm else 0.0
+    assert driven(guard(), pwm, reading(voltage_v=0.5))[0] == pytest.approx(some)
 
 
 def test_the_brake_is_bounded_like_any_command() -> None:
