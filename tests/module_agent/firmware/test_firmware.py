@@ -893,7 +893,7 @@ def test_a_fresh_module_has_nothing_to_say() -> None:
     assert (status.dropped_events, status.expiries, status.refusals, status.note) == (0, 0, {}, "")
     assert (status.motion, bench.firmware.last_rest) == (None, None)
     (first,) = [decode(Status, o.payload) for o in bench.published if o.leaf is Leaf.STATUS]
-    assert (first.limits, first.note) == ((), "")
+    assert (first.limits, first.note, first.seq) == ((), "", 1)
     bench.acquire()
     assert bench.status().note == ""
 
@@ -926,6 +926,20 @@ def test_a_command_lives_its_lifetime_from_the_zero_of_the_clock_to_the_nanoseco
         assert wired.firmware.state == state
 
 
+def test_at_the_first_nanoseconds_a_clock_is_a_clock() -> None:
+    """At 0 a status is sent as at any first time, and a clock that stands still at 1 ns ends the command."""
+    kind = CATALOGUE["X5-9"]
+    wired, rest = WiredFirmware(FirmwareConfig("A", kind, BOOT, catalogue_limits(kind))), Bench()
+    sample = SensorSample(0, 0, *(0.0,) * 6, 40.0, 24.0, *(0.0,) * 6)  # type: ignore[call-arg]
+    _, out = wired.tick(sample)
+    assert Leaf.STATUS in [o.leaf for o in out if isinstance(o, Publication)]
+    acquire = encode(LeaseRequest(**rest.head(action="acquire", token=0, echo_ns=0)))
+    wired.tick(sample._replace(t_ns=1), [Incoming(Leaf.LEASE, acquire, None)])
+    assert wired.firmware.state == "armed"
+    wired.tick(sample._replace(t_ns=1))
+    assert wired.firmware.state == "expired"
+
+
 @pytest.mark.parametrize("is_hot", [False, True])
 def test_a_clock_before_its_zero_is_said_at_once(is_hot: bool) -> None:
     """Whatever the module was: at a time of 0 no status waits for its turn."""
@@ -938,6 +952,26 @@ def test_a_clock_before_its_zero_is_said_at_once(is_hot: bool) -> None:
     bench.tick()
     (status,) = [decode(Status, o.payload) for o in bench.published if o.leaf is Leaf.STATUS]
     assert (status.state, status.t_ns) == ("fault", 0)
+    # And once: that it stays there is no news.
+    bench.published.clear()
+    bench.ticks(10)
+    assert bench.published == []
+
+
+def test_a_motion_is_announced_for_five_seconds_to_the_nanosecond() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(1, ConstantMotion(velocity_rad_s=0.1, duration_s=0.1, ramp_s=0.02))
+    while bench.firmware.state == "moving":
+        bench.tick()
+    bench.now += 5_000 * MS - 2 * MS
+    for announced in (True, False):
+        bench.published.clear()
+        # An expiry and a stop: each of them has a status.
+        bench.tick(*(() if announced else (Incoming(Leaf.STOP, encode(SEND[Leaf.STOP](bench)), None),)))
+        leaves = {o.leaf for o in bench.published}
+        assert Leaf.STATUS in leaves
+        assert (Leaf.MOTION in leaves) is announced
 
 
 def test_a_stop_in_the_first_tick_finds_a_motor_that_is_off() -> None:

@@ -78,6 +78,17 @@ def test_limits_that_act_are_named_in_the_next_status_and_not_for_ever() -> None
     assert last_status(one).limits == ()
 
 
+def test_a_limit_that_acted_for_a_moment_is_in_the_next_status() -> None:
+    one = bench(effort_nm=0.05)
+    one.acquire()
+    for _ in range(3):
+        one.setpoint(2.0)
+    for _ in range(10):
+        one.setpoint(0.2)
+    assert one.pwm == 0.0
+    assert one.status().limits == ("effort",)
+
+
 def test_an_answered_question_does_not_take_the_limits_from_the_next_status() -> None:
     one = bench(effort_nm=0.05)
     one.acquire()
