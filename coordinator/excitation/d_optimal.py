@@ -5,7 +5,7 @@ another and then in exchange for one another, whose information together has the
 1972; Swevers et al., Optimal robot excitation and identification, 1997, for sines as candidates).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,8 @@ MAX_PASSES = 6
 SHRINK = (1.0, 0.7, 0.5, 0.35)
 # Share of a joint's maximum torque: the inertia, not identified yet, may be larger than the prior.
 TORQUE_SHARE = 0.6
+# What refuses a motion.
+OWN_LINKS, TORQUES, WORKSPACE = "the robot's own links", "the motors' torques", "the workspace"
 
 
 class ExcitationTask(NamedTuple):
@@ -38,6 +40,7 @@ class ExcitationTask(NamedTuple):
     phi: (10 n,) likely bodies; they keep the torques within the motors' limits and are no prior of the
         information. reach_rad: how far from home any joint may go. max_effort_nm: of the motors.
     torque_sigma_nm: noise of a torque reading. travel_speed_rad_s: of the ways from home to the poses.
+    allowed: whether the robot may be at positions (m, n); None if it may be anywhere.
     """
 
     chain: Chain
@@ -50,6 +53,7 @@ class ExcitationTask(NamedTuple):
     segments: int
     segment_s: float
     travel_speed_rad_s: float = 1.0
+    allowed: Callable[[Array], bool] | None = None
 
 
 class Excitation(NamedTuple):
@@ -74,7 +78,7 @@ def design_excitation(
     """
     kept: list[Segment] = []
     pieces: list[Array] = []
-    reasons = {"the robot's own links": 0, "the motors' torques": 0}
+    reasons = dict.fromkeys((OWN_LINKS, TORQUES, WORKSPACE), 0)
     for _ in range(candidates):
         segment = draw_possible(task, rng)
         if isinstance(segment, Segment):
@@ -124,13 +128,14 @@ def _reason_against(task: ExcitationTask, segment: Segment) -> str:
     motion = sampled(segment, RATE_HZ)
     torque = inverse_dynamics(task.chain, task.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     if (np.abs(torque) > TORQUE_SHARE * task.max_effort_nm).any():
-        return "the motors' torques"
+        return TORQUES
     # The way back is another: short journeys end first on both.
     ends = task.home_rad, segment.pose_rad
     ways = [way(*pair, task.travel_speed_rad_s, RATE_HZ) for pair in (ends, ends[::-1])]
-    if clearance_m(task.chain, np.vstack([motion.q_rad, *ways]), task.home_rad).min() < CLEARANCE_M:
-        return "the robot's own links"
-    return ""
+    positions = np.vstack([motion.q_rad, *ways])
+    if clearance_m(task.chain, positions, task.home_rad).min() < CLEARANCE_M:
+        return OWN_LINKS
+    return "" if task.allowed is None or task.allowed(positions) else WORKSPACE
 
 
 def _log_det(total: Array) -> float:

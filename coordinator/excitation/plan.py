@@ -39,6 +39,9 @@ class Plan(BaseModel):
     link_s: Seconds = 1.0
     home_rad: float = 0.0
     travel_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
+    # Before anything else the robot goes home, and every joint a little to either side, no faster than this;
+    # a joint that is blocked ends the session. None for no such trial.
+    trial_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     settle_s: Seconds = 0.6
     rest_s: Seconds = 2.0
     # Thesis 6.2.1.1: from an offset of 0.5 rad at 1 rad/s for 0.75 s.

@@ -1,6 +1,6 @@
 """Excitation of a robot whose chain is identified and whose bodies have only a prior."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,9 +32,15 @@ class RobotModule(NamedTuple):
 
 
 def robot_excitation(
-    chain: Chain, modules: Sequence[RobotModule], plan: Plan, seed: int = 0
+    chain: Chain,
+    modules: Sequence[RobotModule],
+    plan: Plan,
+    seed: int = 0,
+    allowed: Callable[[Array], bool] | None = None,
 ) -> tuple[RobotMotion, ...]:
     """Return the motions to which parameters are fitted, and one more at the end that is held out.
+
+    All stay at positions (m, n) that are `allowed`, and so do the ways from home to them and back.
 
     The same robot and seed have the same motions: a run that resumes goes on with those that it began with.
 
@@ -43,7 +49,7 @@ def robot_excitation(
         ValueError: there is not one module per joint.
     """
     rng = np.random.default_rng(seed)
-    task = excitation_task(chain, modules, plan)
+    task = excitation_task(chain, modules, plan)._replace(allowed=allowed)
     chosen = design_excitation(task, rng).segments
     for _ in range(DRAWS):
         held_out = draw_possible(task, rng)

@@ -23,6 +23,10 @@ class RobotStopped(RobotError):
         self.serial = serial
 
 
+class MotionForbidden(RobotError):
+    """A motion would leave what the robot may use; nothing of it was commanded. The message says where."""
+
+
 class MotionInterrupted(RobotError):
     """A motion did not complete; it can be tried again after re-arming."""
 

@@ -50,6 +50,9 @@ PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
 # already: it had begun, and the answer and the keep-alives were lost.
 UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
 
+Gate = Callable[[Mapping[str, Pattern], Mapping[str, float]], None]
+"""Raises `MotionForbidden` against motions that modules are to begin together from positions [rad] of all."""
+
 T = TypeVar("T")
 M = TypeVar("M", bound=Message)
 
@@ -63,9 +66,20 @@ class _Started(NamedTuple):
 
 
 class ModuleGroup:
-    """Commands to the modules of one robot under this sender's leases."""
+    """Commands to the modules of one robot under this sender's leases.
 
-    def __init__(self, messenger: Messenger, recording: Recording, clock: Clock, sender: Sender):
+    Every motion passes the `gate`, if there is one, before any of it is commanded.
+    """
+
+    def __init__(
+        self,
+        messenger: Messenger,
+        recording: Recording,
+        clock: Clock,
+        sender: Sender,
+        gate: Gate | None = None,
+    ):
+        self._gate = gate
         self.serials: tuple[str, ...] = ()
         self.sender, self._secret = sender
         self._messenger = messenger
@@ -110,6 +124,12 @@ class ModuleGroup:
             log = self.module(serial).rows
             self._rows[serial] = RowCompletion(log, partial(self._fetch, serial))
         self.serials = tuple(serials)
+
+    def position_rad(self, serial: str) -> float | None:
+        """Return the latest position of a joint; None before any feedback."""
+        log = self.module(serial).rows
+        rows = log.rows(log.end_row - 1, log.end_row)
+        return float(rows["position_rad"][-1]) if len(rows) else None
 
     def without_feedback(self) -> list[str]:
         """Return the serials of the modules whose feedback has not been received yet."""
@@ -347,10 +367,13 @@ class ModuleGroup:
 
         Raises:
             KeyError: efforts of a module that has no motion.
+            MotionForbidden: the gate does not let the motions pass.
             MotionInterrupted: one of them expired or was stopped, or another held module expired meanwhile.
             ModuleLost: see `check`.
         """
         fed = efforts or {}
+        if self._gate is not None:
+            self._gate(patterns, {s: q for s in self.serials if (q := self.position_rad(s)) is not None})
         if idle := [serial for serial in fed if serial not in patterns]:
             raise KeyError(
                 f"efforts for {idle[0]}, which has no motion; of those that have one: {', '.join(patterns)}"

@@ -4,9 +4,9 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -70,13 +70,33 @@ from coordinator.viewer.feed import Overlay, Screen, ViewerFeed
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.catalogue import ModuleType, module_type
-from module_agent.model.chain import Chain
+from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError, UsageError
 from module_agent.transport.transport import Transport
-from module_agent.wire.messages import Message
+from module_agent.wire.messages import Message, Pattern
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
+
+
+class MotionGate(Protocol):
+    """What a robot may do, whatever the plan says."""
+
+    def admit(self, patterns: Mapping[str, Pattern], at_rad: Mapping[str, float]) -> None:
+        """Let motions pass that begin together at positions of all joints.
+
+        Raises:
+            MotionForbidden: they would leave what the robot may use.
+        """
+        ...
+
+    def learn(self, chain: Chain) -> None:
+        """Take in the robot as it was explored."""
+        ...
+
+    def allows(self, q_rad: Array) -> bool:
+        """Return whether the robot may be at positions (m, n), in the order of the chain learnt last."""
+        ...
 
 
 class RunConfig(NamedTuple):
@@ -89,6 +109,7 @@ class RunConfig(NamedTuple):
     measured: folders of runs or merges with some of the modules, whose IMUs are known as well as they tell.
     report: write a page for people into the folder, of a run that ends early too.
     max_bytes: of the recording; a run that reaches it stops the robot and ends.
+    gate: every motion passes it before it is commanded; None if the robot may do all that is planned.
     """
 
     robot: str
@@ -104,6 +125,7 @@ class RunConfig(NamedTuple):
     measured: tuple[Path, ...] = ()
     report: bool = False
     max_bytes: int | None = None
+    gate: MotionGate | None = None
 
 
 class _Undisturbed:
@@ -180,7 +202,8 @@ class Run:
         # Virtual time has no cost of its own that would be one of the machine's.
         cpu_clock = None if config.inline else time.thread_time_ns
         self._messenger = Messenger(transport, config.robot, clock, post, self._record, cpu_clock)
-        self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender)
+        gate = config.gate.admit if config.gate is not None else None
+        self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender, gate)
         self._requests = InformationRequests(
             self._messenger, self.recording, clock, config.sender.name, self.note
         )
@@ -285,6 +308,8 @@ class Run:
         self._explored = explored
         kinematics = await self._compute(lambda: self._with_baseline(explored))
         self._chain = kinematics.fit.chain
+        if self._config.gate is not None:
+            self._config.gate.learn(self._chain)
         self._feed.chain(self._clock(), kinematics.fit)
         for line in kinematics.summary():
             self._screen.note(line)
@@ -292,10 +317,11 @@ class Run:
     async def excitation(self) -> tuple[RobotMotion, ...]:
         """Design excitation motions of all joints at once for the identified chain."""
         assert self._chain is not None, "all joints are explored before any is excited"
-        chain, plan = self._chain, self._config.plan
+        chain, plan, gate = self._chain, self._config.plan, self._config.gate
+        allowed = None if gate is None else gate.allows
         modules = [RobotModule(self._group.kind(s), self._group.info(s).limits) for s in chain.serials]
         try:
-            return await self._compute(lambda: robot_excitation(chain, modules, plan))
+            return await self._compute(lambda: robot_excitation(chain, modules, plan, allowed=allowed))
         except NoExcitation as error:
             self._screen.note(f"{error}; exciting joint by joint instead")
             return ()

@@ -31,6 +31,10 @@ DISCOVERY_POLL_S = 0.05
 ESTIMATE_WAIT_S = 0.6
 # A poor network interrupts more than one motion in ten: factor on the plan's retries.
 POOR_RETRIES = 4
+# How far a slow trial moves every joint to either side, and the share of the way that it has to come along:
+# held joints give under gravity, an X5-4 that holds a whole arm by a third of the way.
+TRIAL_RAD = 0.08
+MIN_MOVED_SHARE = 0.5
 # Rest of a run that moves all joints at once, for speed: 1 s determines the gyros' biases to 0.1 mrad/s.
 SIMULTANEOUS_REST_S = 1.0
 
@@ -56,6 +60,10 @@ class Reporter(Screen, Protocol):
         Empty if none is feasible on this robot.
         """
         ...
+
+
+class JointBlocked(RobotError):
+    """A joint did not come along with a slow motion of its own; the message names it."""
 
 
 class NoModulesFound(RobotError):
@@ -108,13 +116,21 @@ class Session:
         explorations = (
             1 if self._plan.mode == "simultaneous" else len(serials) + (self._plan.motions == "optimised")
         )
-        self._total = 6 + explorations + (self._excitations(len(serials)) if self._plan.dynamics else 0)
+        self._total = (
+            6
+            + (self._plan.trial_speed_rad_s is not None)
+            + explorations
+            + (self._excitations(len(serials)) if self._plan.dynamics else 0)
+        )
         self._invalidate_steps_before_boot()
         starts = {s: self._position(s) for s in serials}
         try:
             # The keep-alives first: a lease must not expire while the next module is slow to answer.
             self._keeper = asyncio.create_task(self.group.keep_alive())
             await self._arm()
+            if self._plan.trial_speed_rad_s is not None:
+                work = partial(self._try_slowly, self._plan.trial_speed_rad_s)
+                await self._step("trial", "every joint slowly, a little", work)
             await self._step_unless_excluded("home", "all joints to their home position", self._home)
             await self._step("rest", "listening at rest", self._rest)
             if self._plan.mode == "simultaneous":
@@ -260,6 +276,27 @@ class Session:
     async def _home(self) -> None:
         await self._go(dict.fromkeys(self._excluded.movers(), self._plan.home_rad))
 
+    async def _try_slowly(self, speed_rad_s: float) -> None:
+        """Go home slowly, then move every joint by itself a little to either side.
+
+        Raises:
+            JointBlocked: one does not come along.
+        """
+        home = self._plan.home_rad
+        await self._go(dict.fromkeys(self._excluded.movers(), home), speed_rad_s)
+        for serial in self._excluded.movers():
+            for target, wanted in ((home + TRIAL_RAD, TRIAL_RAD), (home - TRIAL_RAD, -2.0 * TRIAL_RAD)):
+                before = self._position(serial)
+                await self._go({serial: target}, speed_rad_s)
+                # Under gravity a held joint stands aside of where it is to be, before as after.
+                moved = self._position(serial) - before
+                if moved / wanted < MIN_MOVED_SHARE:
+                    raise JointBlocked(
+                        f"joint {serial} was to move by {wanted:+.3f} rad and moved by {moved:+.3f} rad, "
+                        "slowly and by itself: something is in its way, or holds it; see that it is free"
+                    )
+            await self._go({serial: home}, speed_rad_s)
+
     async def _rest(self) -> None:
         longest_s = SIMULTANEOUS_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
         pattern = Rest(duration_s=min(longest_s, self._plan.rest_s))
@@ -389,8 +426,8 @@ class Session:
 
     # ------------------------------------------------------------------ pieces
 
-    async def _go(self, targets_rad: Mapping[str, float]) -> None:
-        speed = self._plan.travel_speed_rad_s
+    async def _go(self, targets_rad: Mapping[str, float], speed_rad_s: float | None = None) -> None:
+        speed = speed_rad_s or self._plan.travel_speed_rad_s
         await self.group.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
         await asyncio.sleep(self._plan.settle_s)
 
@@ -414,9 +451,8 @@ class Session:
         )
 
     def _position(self, serial: str) -> float:
-        log = self.group.module(serial).rows
-        rows = log.rows(log.end_row - 1, log.end_row)
-        return float(rows["position_rad"][-1]) if len(rows) else self._plan.home_rad
+        position_rad = self.group.position_rad(serial)
+        return self._plan.home_rad if position_rad is None else position_rad
 
     def _report(self, text: str) -> None:
         self._index += 1
