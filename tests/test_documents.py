@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import typer
 
+from coordinator.attendant.workspace import load_workspace
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.topics import TOPICS
 from sim.benchmark.cases.suites import (
@@ -215,6 +216,15 @@ def test_the_robot_file_of_the_guide_is_a_robot(tmp_path: Path) -> None:
     robot = load_robot(path)
     assert [module.serial for module in robot.modules] == ["shoulder", "elbow"]
     assert [obstacle.name for obstacle in robot.obstacles] == ["table"]
+
+
+def test_the_workspace_of_the_guide_is_one(tmp_path: Path) -> None:
+    path = tmp_path / "room.toml"
+    (text,) = [block for block in blocks("ini", "guide.md") if "[box]" in block]
+    path.write_text(text)
+    workspace = load_workspace(path)
+    assert workspace.range_rad("elbow") == (-0.8, 1.0)
+    assert workspace.tool_m == 0.1
 
 
 def test_the_wire_page_has_every_topic_with_its_messages() -> None:

@@ -5,7 +5,7 @@ model that holds, and while the robot is measured there is none.
 """
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, TypeVar
 
 from coordinator.attendant.attendant import Attendant, Measurement, Observation, Outcome, Patience, Step
@@ -121,7 +121,7 @@ class AttendSession:
         def looked() -> bool:
             nonlocal wanted
             findings = monitor.finding_log.all
-            seen = observation(site.clock(), messenger.alive, live.recording, findings)
+            seen = observation(site.clock(), messenger.alive, live.recording, findings, site.sender.name)
             wanted = self._take(attendant.look(seen))
             return wanted is not None
 
@@ -142,13 +142,15 @@ class AttendSession:
         self._listener.say(text, self._site.clock())
 
 
-def observation(t_ns: int, alive: set[str], recording: Recording, findings: Sequence[Finding]) -> Observation:
-    """Return what is known of the modules that are on the network."""
+def observation(
+    t_ns: int, alive: set[str], recording: Recording, findings: Sequence[Finding], own_name: str
+) -> Observation:
+    """Return what is known of the modules that are on the network; the asking program holds none any more."""
     records = {s: recording.modules[s] for s in sorted(alive) if s in recording.modules}
     present = {serial: records[serial].boot if serial in records else 0 for serial in sorted(alive)}
-    holders: Mapping[str, str] = {
+    holders = {
         serial: record.status.holder
         for serial, record in records.items()
-        if record.status is not None and record.status.holder is not None
+        if record.status is not None and record.status.holder not in (None, own_name)
     }
-    return Observation(t_ns, present, findings, holders)
+    return Observation(t_ns, present, findings, {s: str(holder) for s, holder in holders.items()})

@@ -106,7 +106,7 @@ class Attendant:
         }
         # Since when a module is there, or is not.
         self._since: dict[str, tuple[bool, int]] = {}
-        self._begun_ns: int | None = None
+        self._present_ns: int | None = None
         self._boots: dict[str, int] = {}
         self._off = False
         self._structure: tuple[str, ...] = ()
@@ -114,6 +114,7 @@ class Attendant:
         # Findings that a measurement did not confirm: until when they are no reason for another.
         self._answered_ns: dict[tuple[str, str], int] = {}
         self._announced: tuple[str, ...] = ()
+        self._tried: set[str] = set()
         self._waits_for = ""
         self._clear_ns: int | None = None
         self._failures = 0
@@ -121,15 +122,21 @@ class Attendant:
 
     def look(self, seen: Observation) -> Step:
         """Take in what is there now; return what to say, and what to measure."""
-        if self._begun_ns is None:
-            self._begun_ns = seen.t_ns
-        say = [*self._presence(seen), *self._boots_anew(seen), *self._findings(seen)]
+        if self._present_ns is None or seen.present:
+            self._present_ns = seen.t_ns
+        since_ns = seen.t_ns if self._present_ns is None else self._present_ns
+        off = self._lasts(seen.t_ns, since_ns, self._patience.gone_s)
+        if not seen.present and not off:
+            # All at once: a switch, or the network, and not one that is plugged.
+            return Step()
+        say = [*self._presence(seen, off), *self._boots_anew(seen), *self._findings(seen)]
         causes = self._causes()
         texts = tuple(cause.text for cause in causes)
         if texts != self._announced:
-            # Other causes: what was tried for the former ones does not count.
             self._announced, self._waits_for, self._clear_ns = texts, "", None
-            self._failures, self._not_before_ns = 0, _NEVER_NS
+            if not set(texts) <= self._tried:
+                # Something else: what was tried in vain before does not count.
+                self._tried, self._failures, self._not_before_ns = set(texts), 0, _NEVER_NS
             if texts and not self._may_move:
                 say.append(
                     "the model does not hold any more; with --may-move the robot would be measured again"
@@ -144,7 +151,7 @@ class Attendant:
 
     def ended(self, t_ns: int, measured: Measurement, outcome: Outcome) -> Step:
         """Take in how a measurement ended; the monitor begins anew with it, and so do its findings."""
-        self._clear_ns, self._waits_for = None, ""
+        self._clear_ns, self._waits_for, self._present_ns = None, "", t_ns
         if outcome.what == "failed":
             self._failures += 1
             self._not_before_ns = t_ns + round(1e9 * self._patience.retry_s)
@@ -154,28 +161,27 @@ class Attendant:
             )
             return Step((f"could not be measured, {after}: {'; '.join(outcome.words)}",))
         if outcome.what == "replaced":
-            self.known = frozenset(measured.modules)
+            self.known, self._structure = frozenset(measured.modules), ()
             self._answered_ns.clear()
         else:
             until_ns = t_ns + round(1e9 * self._patience.again_s)
             self._answered_ns |= {cause.of: until_ns for cause in self._lasting.values()}
         self._lasting.clear()
-        self._announced = ()
+        self._announced, self._tried = (), set()
         return Step(outcome.words)
 
     # ------------------------------------------------------------------ what has changed
 
-    def _presence(self, seen: Observation) -> list[str]:
+    def _presence(self, seen: Observation, off: bool) -> list[str]:
         """Note who came and went; say it where it lasts."""
+        say = []
         for serial in {*self.known, *seen.present, *self._since}:
             there = serial in seen.present
             was = self._since.get(serial)
             if was is None or was[0] != there:
                 # Of those that never were there, nothing is known before the beginning.
                 self._since[serial] = there, seen.t_ns
-        off = not seen.present and self._lasts(seen.t_ns, self._begun_ns or 0, self._patience.gone_s)
-        say = []
-        if off != self._off and (off or seen.present):
+        if off != self._off:
             self._off = off
             say.append("no module is on the network any more" if off else "modules are on the network again")
         if self._off:
@@ -234,7 +240,8 @@ class Attendant:
                 continue
             if aim is None or finding.until_ns is not None:
                 continue
-            if seen.t_ns < self._answered_ns.get(of, _NEVER_NS):
+            # Of a robot with other modules the monitor's model says nothing.
+            if self._structure or seen.t_ns < self._answered_ns.get(of, _NEVER_NS):
                 continue
             if self._lasts(seen.t_ns, finding.detected_ns, self._lasts_s[finding.kind]):
                 self._lasting[finding.key] = _Cause(aim, finding.summary, of, seen.t_ns)

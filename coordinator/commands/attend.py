@@ -1,14 +1,17 @@
-"""`x5-coordinator attend`: stay with a known robot, and say when it is not the known one any more."""
+"""`x5-coordinator attend`: stay with a known robot, say when it has changed, and measure it again."""
 
 import asyncio
 import contextlib
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from coordinator.attendant.attend_session import AttendSession, Site
-from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
+from coordinator.attendant.remeasure import Remeasurement
+from coordinator.attendant.workspace import Workspace, load_workspace
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, PlanFile, Speed, planned
 from coordinator.commands.views.attend import AttendScreen
 from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.monitoring.reference import ALARMS_PER_HOUR
@@ -18,7 +21,7 @@ from coordinator.runtime.event_loop import ScaledLoop
 from coordinator.runtime.event_loop import attend as attend_loop
 from coordinator.runtime.terminal import new_table, print_table
 from coordinator.torque_control.gravity_model import read_result
-from module_agent.model.errors import EXIT_FINDING
+from module_agent.model.errors import EXIT_FINDING, UsageError
 
 
 def utc_now() -> str:
@@ -30,6 +33,13 @@ def utc_now() -> str:
 def attend(
     baseline: DynamicsFolder,
     at: ConnectOptions,
+    may_move: Annotated[
+        bool, typer.Option("--may-move", help="Move the robot to measure it again; needs --workspace.")
+    ] = False,
+    workspace: Annotated[
+        Path | None, typer.Option(help="TOML file of what the robot may use when it is measured again.")
+    ] = None,
+    plan: PlanFile = None,
     history: Annotated[
         bool, typer.Option("--history", help="List the versions of the model, and end.")
     ] = False,
@@ -45,10 +55,12 @@ def attend(
     json_file: JsonFile = None,
     speed: Speed = 1.0,
 ) -> None:
-    """Stay with a known robot, and say when it is not the known one any more.
+    """Stay with a known robot, say when it is not the known one any more, and measure it again if allowed to.
 
-    Modules that come, go or are exchanged, links that are displaced, and payloads that stay are said; nothing
-    is commanded. Exit codes: 0 nothing changed, 4 something did, others as of `run`.
+    Modules that come, go or are exchanged, links that are displaced, and payloads that stay are said. With
+    --may-move the robot is then measured again, slowly at first and within the workspace, after a notice of
+    10 s, and the new model is the current version of FOLDER; without it nothing is commanded. Ctrl-C stops
+    all modules. Exit codes: 0 nothing changed, 4 something did, others as of `run`.
     """
     versions = Versions(baseline)
     if use is not None:
@@ -56,9 +68,13 @@ def attend(
     if history or use is not None:
         _print_history(versions)
         return
+    room = _workspace(may_move, workspace)
+    settings, known = planned(plan), read_result(baseline)
+    if room is not None:
+        # Refused now, and not when something has changed.
+        room.plan(settings, known.serials)
     loop = ScaledLoop(speed)
-    place = at.place(read_result(baseline).robot)
-    screen = AttendScreen(json_file, at.quiet)
+    place, screen = at.place(known.robot), AttendScreen(json_file, at.quiet)
     # The hub of the agents, if there is no other, stays as long as this program.
     hub = open_connection(place, screen.note)
     site = Site(
@@ -69,7 +85,8 @@ def attend(
         sender=new_sender(),
         utc=utc_now,
     )
-    session = AttendSession(site, versions, screen, alarms_per_hour=alarms_per_hour)
+    measurer = None if room is None else Remeasurement(site, versions, room, screen, settings)
+    session = AttendSession(site, versions, screen, measurer, alarms_per_hour)
     until_ns = None if for_s is None else loop.clock_ns() + round(for_s * 1e9)
     try:
         # A signal ends it in order.
@@ -79,6 +96,20 @@ def attend(
         hub.transport.close()
     if session.changed:
         raise typer.Exit(EXIT_FINDING)
+
+
+def _workspace(may_move: bool, file: Path | None) -> Workspace | None:
+    """Return the workspace in which the robot may be moved, None if it may not.
+
+    Raises:
+        UsageError: one of the two options is missing, or the file is no workspace.
+    """
+    if may_move != (file is not None):
+        raise UsageError(
+            "--may-move and --workspace FILE belong together: the file says where the robot may be when "
+            "it is measured again"
+        )
+    return None if file is None else load_workspace(file)
 
 
 def _print_history(versions: Versions) -> None:

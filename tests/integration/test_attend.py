@@ -63,6 +63,9 @@ def test_a_folder_without_a_run_and_an_unknown_version_are_refused(known_folder,
     assert nothing.returncode == 2
     assert "holds no result.json" in nothing.stderr
     known = known_folder(ROBOT)
+    blind = attend(str(known), "--may-move")
+    assert blind.returncode == 2
+    assert "--workspace" in blind.stderr
     assert attend(str(known), "--use", "7").returncode == 2
     listed = attend(str(known), "--use", "1")
     assert listed.returncode == 0, listed.stderr

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulation.attended_robot import Scene
+from coordinator.attendant.workspace import Box
+from tests.simulation.attended_robot import CHANGES, LAST, ROOM, Scene, remeasured
 from tests.simulation.known_arm import ARM, LOADED
 
 # Tests of this group share recorded runs: they stay in one process.
@@ -25,3 +26,35 @@ def test_without_leave_to_move_it_says_what_was_put_on_and_what_left(known_arm: 
     # No lease was taken: only the mover's was, and the arm has been limp since.
     assert scene.versions.history == ()
     assert all(host.modules[0].firmware.state == "idle" for host in scene.robot.hosts.values())
+
+
+@pytest.mark.parametrize("name", ["0.2 kg put on", "a module exchanged"])
+def test_what_has_changed_is_measured_again_and_the_new_model_holds(
+    name: str, known_arm: Path, tmp_path: Path
+) -> None:
+    """The other changes, and the time that they take, are a benchmark."""
+    scene = Scene(known_arm, tmp_path / "arm", ROOM)
+    done = remeasured(scene, CHANGES[name])
+    assert done.robot_time_s < 120.0
+    # Of the few links of one arm one is beyond three sigmas once in a hundred arms.
+    assert all(abs(sigmas) < 3.0 for sigmas in done.link_sigmas.values()), done.link_sigmas
+    # 2 % of the 1.4 to 1.9 Nm that hold the arm.
+    assert done.gravity_nm < 0.04
+    assert done.gravity_before_nm is None or done.gravity_before_nm > 5.0 * done.gravity_nm
+    (entry,) = scene.versions.history
+    assert (entry.what, entry.version) == ("replaced", 2)
+    assert scene.versions.current == scene.versions.folder / "versions" / "0002"
+    # It began slowly, after a notice, and goes on with the new model without a word.
+    assert any("every joint slowly" in line for line in scene.ears.noted)
+    (announced,) = scene.ears.heard("THE ROBOT MOVES")
+    assert not [text for at_s, text in scene.ears.said if at_s > announced + 100.0]
+
+
+def test_a_workspace_without_room_keeps_the_model(known_arm: Path, tmp_path: Path) -> None:
+    cramped = ROOM.model_copy(update={"box": Box(low_m=(-0.2, -0.2, -0.2), high_m=(0.2, 0.2, 0.2))})
+    scene = Scene(known_arm, tmp_path / "arm", cramped)
+    scene.at(2.0, lambda: scene.robot.kill(LAST))
+    scene.plays(45.0)
+    assert scene.ears.heard("could not be measured")
+    assert [entry.what for entry in scene.versions.history] == ["failed"]
+    assert scene.versions.current == scene.versions.folder

@@ -25,6 +25,10 @@ class AttendScreen(Displayed):
         self._print(text, t_ns)
         self._lines.write({"t_ns": t_ns, "says": text})
 
+    def step(self, index: int, total: int, text: str) -> None:
+        """Show that a step of a measurement begins."""
+        self.note(f"[{index}/{total}] {text}")
+
     def report(self, update: MonitorUpdate) -> None:
         """Show what the monitor finds; what hinders it goes to the JSON lines only."""
         for note in update.notes:

@@ -253,9 +253,19 @@ def test_measurements_that_fail_are_tried_again_a_few_times_and_no_more() -> Non
     assert story.goes_on(60.0) is not None
 
 
+def test_of_a_robot_with_other_modules_the_monitor_knows_nothing() -> None:
+    story = Story()
+    story.present = ARM | {"hand": 22}
+    story.findings = [found("wear", 3.0)]
+    measured = story.goes_on(60.0)
+    assert measured is not None
+    assert measured.why == ("module hand is new",)
+
+
 def test_a_displaced_link_and_a_new_module_are_measured_together() -> None:
     story = Story()
     story.findings = [found("wear", 0.0)]
+    story.goes_on(WAIT.link_s + 1.0)
     story.present = ARM | {"hand": 22}
     measured = story.goes_on(60.0)
     assert measured is not None
