@@ -7,8 +7,11 @@ virtual time inside the simulator; only hardware, transport and worker differ.
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+
 from module_agent.control.controller import Command
 from module_agent.estimate.observer import Finding, Observer
+from module_agent.firmware.bus_run import MANY_TICKS, BusRun
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, acknowledgement
 from module_agent.firmware.quiet_ticks import NOT_QUIET, ROW_DUE, QuietTicks
@@ -72,9 +75,9 @@ class HostedModule:
         self.serial = config.serial
         self.firmware = Firmware(config, modules, index)
         self.observer = Observer(config.serial, config.boot, IMU_PRIORS[config.imu])
-        self.inbox = Inbox(MAX_MESSAGE_BYTES)
+        self.inbox = Inbox(MAX_MESSAGE_BYTES, bell=host.bell)
         # Apart from all else, and read to its end in every tick, so that no flood can keep a stop out.
-        self.stops = Inbox(TOPICS[Leaf.STOP].max_bytes_to_module)
+        self.stops = Inbox(TOPICS[Leaf.STOP].max_bytes_to_module, bell=host.bell)
         self.now_ns = 0
         self.requests: dict[int, Request] = {}
         self._request_id = 0
@@ -187,6 +190,8 @@ class AgentHost:
     ):
         self.worker = worker
         self.collection = MotionCollection()
+        # Rung by whatever arrives, for a kernel that runs ticks until then.
+        self.bell = memoryview(bytearray(1))
         self.modules = [
             HostedModule(robot, config, modules, index, self) for index, config in enumerate(configs)
         ]
@@ -194,7 +199,7 @@ class AgentHost:
         self._hardware = modules
         self._transport = transport
         self._motion_listener = MotionListener()
-        self._from_others = Inbox(MAX_MESSAGE_BYTES)
+        self._from_others = Inbox(MAX_MESSAGE_BYTES, bell=self.bell)
         self._findings: list[tuple[HostedModule, Finding]] = []
         self._listening: dict[str, Undeclare] = {}
         self._declared: list[Undeclare] = []
@@ -203,11 +208,15 @@ class AgentHost:
         self._seq = 0
         self._place = place
         self._quiet = quiet
+        self._bus_run: BusRun | None = None
         if isinstance(modules, LoopInside):
             self._loops = modules
             self._quiet = quiet = quiet or QuietTicks(len(self.modules))
             for index, module in enumerate(self.modules):
                 quiet.attach(place + index, module.firmware, modules, index)
+            if modules.bus is not None:
+                bell = np.frombuffer(self.bell, np.uint8)
+                self._bus_run = BusRun(modules, modules.bus, quiet, bell)
         self._declare()
 
     @property
@@ -235,10 +244,17 @@ class AgentHost:
     def cycle(self) -> None:
         """Run one tick of all modules: receive samples, send commands, publish.
 
+        On a physics bus it may be several, the last of which needs more than the modules' loops.
+
         Raises:
             HardwareLost: no further tick will come.
         """
+        # Before the look: what arrives after it rings again.
+        self.bell[0] = 0
         busy = self.collect()
+        if self._bus_run is not None:
+            self._cycle_on_bus(self._bus_run, busy)
+            return
         if self._quiet is not None:
             readings = self._loops.exchange(self._quiet.pwm.tolist())
             self.finish(readings, self._quiet.run(readings, busy))
@@ -251,6 +267,13 @@ class AgentHost:
             for outgoing in module.publish(pwm):
                 self._send(module, outgoing)
         self._attend()
+
+    def _cycle_on_bus(self, bus: BusRun, busy: list[int]) -> None:
+        assert self._quiet is not None
+        results = bus.run(busy, 1 if busy or self.has_work else MANY_TICKS)
+        if NOT_QUIET in results or self.has_work:
+            self._quiet.keep_held()
+        self.finish(bus.readings, results)
 
     def collect(self) -> list[int]:
         """Take what has arrived for the modules; return the places of those for which something has.
@@ -367,7 +390,12 @@ class AgentHost:
 
     def _submit(self, module: HostedModule, motion: JointMotion) -> None:
         job = module.observer.job(motion, module.firmware.history, module.firmware.last_rest)
-        self.worker.submit(job, lambda finding: self._findings.append((module, finding)))
+
+        def done(finding: Finding) -> None:
+            self._findings.append((module, finding))
+            self.bell[0] = 1
+
+        self.worker.submit(job, done)
 
     def _listen(self, wanted: Listen) -> None:
         subscription = self._listening.pop(wanted.serial, None)

@@ -86,8 +86,8 @@ class QuietTicks:
         self._times[0], self._times[1] = self._times[1], readings.integers[:, 0]
         kernel.tick(readings.integers, readings.floats, *self.arrays)
         for place in np.flatnonzero(self._results == ROW_DUE).tolist():
-            self._held_rows[place, 0] = self._rows[place : place + 1].view(np.uint8)
-            self._held[place] = 1
+            self._held_rows[place, self._held[place]] = self._rows[place : place + 1].view(np.uint8)
+            self._held[place] += 1
         return self.end_run()
 
     @property
@@ -134,6 +134,11 @@ class QuietTicks:
         out = module.firmware.keep_rows(self._held_rows[place, :count].reshape(-1).data)
         self._held[place], self._room[place] = 0, min(module.firmware.rows_to_batch, _HELD_ROWS)
         return out
+
+    def keep_held(self) -> None:
+        """Give all modules the rows that they hold of earlier ticks, where these complete no batch."""
+        for place in np.flatnonzero((self._held > 0) & (self._held < self._room)).tolist():
+            self.keep_rows(place)
 
     def load(self, place: int) -> None:
         """Let the objects of a module go on from where its quiet ticks ended."""

@@ -3,7 +3,12 @@
 import socket
 import time
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.hardware import packet_kernel as packets
 from module_agent.hardware.bus_frames import (
     MAX_HANDSHAKE_BYTES,
     FrameError,
@@ -12,7 +17,10 @@ from module_agent.hardware.bus_frames import (
     unpack_welcome,
 )
 from module_agent.hardware.hardware import HardwareLost, Readings, WiredModule
+from module_agent.model.compiled import compiled_with
 
+# What kernels and Python keep of a bus: the tick to answer, whether it is answered, the last packet's length.
+TICK, ANSWERED, LENGTH = range(3)
 _RETRY_S = 0.02
 
 
@@ -37,11 +45,21 @@ class BusClient:
         self._frames = TickFrames.of(len(serials))
         self._socket = _connect(path, connect_timeout_s)
         try:
-            self._tick, self._modules = _greet(self._socket, path, serials, connect_timeout_s)
+            tick, self._modules = _greet(self._socket, path, serials, connect_timeout_s)
         except BaseException:
             self._socket.close()
             raise
-        self._readings = Readings(len(self._modules))
+        count = len(self._modules)
+        self._answer = np.zeros(1 + count)
+        self._words = np.zeros(self._frames.samples_bytes // 8)
+        self.readings = Readings(count, self._words[1:])
+        self._state = np.array([tick, 0, 0])
+
+    @property
+    def kernel_state(self) -> tuple[Any, ...]:
+        """What `answer` and `receive` need: descriptor, words out as floats and integers, words in, state."""
+        out, own = self._answer, self._words.view(np.int64)
+        return self._socket.fileno(), out, out.view(np.int64), own, self._state
 
     @property
     def modules(self) -> Sequence[WiredModule]:
@@ -51,24 +69,30 @@ class BusClient:
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Answer the last tick with one PWM in [-1, 1] per module and wait for the next.
 
+        A tick that a kernel has answered already is not answered again.
+
         Raises:
             HardwareLost: the world ended, or dropped this agent because of a PWM out of range.
             ValueError: not one PWM per module.
         """
         if len(pwm) != len(self._modules):
             raise ValueError(f"{len(pwm)} PWM values for {len(self._modules)} modules")
+        if self._state[LENGTH] > 0:
+            raise HardwareLost(f"the physics bus is out of step: a frame of {self._state[LENGTH]} bytes came")
         try:
-            self._socket.send(self._frames.pack_pwm(self._tick, pwm))
+            if not self._state[ANSWERED]:
+                self._socket.send(self._frames.pack_pwm(int(self._state[TICK]), pwm))
+                self._state[ANSWERED] = 1
             frame = self._socket.recv(self._frames.samples_bytes + 1)
         except OSError as error:
             raise HardwareLost(f"the physics bus is gone: {error.strerror or error}") from error
         if not frame:
             raise HardwareLost("the physics bus is gone: the world closed it")
         try:
-            self._tick = self._frames.unpack_samples(frame, self._readings)
+            self._state[:2] = self._frames.unpack_samples(frame, self.readings), 0
         except FrameError as error:
             raise HardwareLost(f"the physics bus is out of step: {error}") from error
-        return self._readings
+        return self.readings
 
     def close(self) -> None:
         """Release the modules; a thread that waits in `exchange` gets `HardwareLost`. May be called twice."""
@@ -80,6 +104,32 @@ class BusClient:
             pass
         finally:
             self._socket.close()
+
+
+@compiled_with(packets)
+def answer(bus: Any, pwm: NDArray[np.float64]) -> bool:
+    """Answer the last tick of a bus, see `kernel_state`, with the PWM of its n modules; return whether it is.
+
+    One that has been answered already is not answered again.
+    """
+    descriptor, out, out_words, _, state = bus
+    if not state[ANSWERED]:
+        out_words[0] = state[TICK]
+        for i in range(len(pwm)):
+            out[1 + i] = pwm[i]
+        state[ANSWERED] = packets.send(descriptor, out_words, len(out), True)
+    return bool(state[ANSWERED])
+
+
+@compiled_with(packets)
+def receive(bus: Any) -> bool:
+    """Wait for the samples of the next tick, which go into `readings`; return whether they have come."""
+    descriptor, _, _, own, state = bus
+    state[LENGTH] = packets.receive(descriptor, own, len(own))
+    if state[LENGTH] != 8 * len(own):
+        return False
+    state[TICK], state[ANSWERED], state[LENGTH] = own[0], 0, 0
+    return True
 
 
 def _connect(path: str, timeout_s: float) -> socket.socket:

@@ -11,6 +11,7 @@ from enum import IntFlag
 from typing import NamedTuple, Protocol, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from module_agent.control.controller import Command
 from module_agent.control.safety import UNCONFIGURED, Safety
@@ -52,11 +53,12 @@ class Readings(Sequence[SensorSample]):
 
     floats and integers (n, 17) are the same memory in the order of `SensorSample`; times are in the first two
     columns of `integers`, all else in the others of `floats`. `block` is that memory as bytes. As a sequence
-    it has the sample of each module, 136 bytes each.
+    it has the sample of each module, 136 bytes each. `memory` is that of these floats, if it exists already.
     """
 
-    def __init__(self, modules: int):
-        self.floats = np.zeros((modules, len(SensorSample._fields)))
+    def __init__(self, modules: int, memory: NDArray[np.float64] | None = None):
+        columns = len(SensorSample._fields)
+        self.floats = np.zeros((modules, columns)) if memory is None else memory.reshape(modules, columns)
         self.integers = self.floats.view(np.int64)
         self.block = self.floats.data.cast("B")
 

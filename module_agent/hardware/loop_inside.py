@@ -11,6 +11,7 @@ from typing import NamedTuple
 from module_agent.control.controller import MOTOR_OFF, Command, Controller
 from module_agent.control.gains import catalogue_limits, default_gains
 from module_agent.control.safety import UNCONFIGURED, Safety
+from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.hardware import (
     LimitState,
     ModuleInformation,
@@ -110,6 +111,11 @@ class LoopInside:
         self._sequence = 0
 
     @property
+    def bus(self) -> BusClient | None:
+        """The physics bus that the wires are, if they are one."""
+        return self._wires if isinstance(self._wires, BusClient) else None
+
+    @property
     def information(self) -> Sequence[ModuleInformation]:
         """The modules, named like their serials, with the limits of the catalogue and the gains in force."""
         return tuple(drive.information for drive in self._drives)
@@ -153,9 +159,13 @@ class LoopInside:
         Raises:
             HardwareLost: no further tick will come.
         """
-        self._sequence += 1
+        self.count(1)
         read = self._wires.exchange(pwm)
         return read if isinstance(read, Readings) else Readings.of(read)
+
+    def count(self, ticks: int) -> None:
+        """Count ticks whose readings a kernel has exchanged."""
+        self._sequence += ticks
 
     def take(self, index: int, read: SensorSample) -> ModuleSample:
         """Check what one module has read; return its sample."""

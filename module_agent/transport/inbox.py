@@ -33,12 +33,20 @@ class Inbox:
         lane_bytes: of the events of one kind on one key.
         total_bytes: of all.
         longest: the most bytes of a payload that are read.
+        bell: memory whose first element becomes 1 with every event, for those who wait for several inboxes.
 
     `waiting` is true while there may be events: the cheapest test in a tick.
     """
 
-    def __init__(self, longest: int, lane_bytes: int = 256 * _KIB, total_bytes: int = 8192 * _KIB):
+    def __init__(
+        self,
+        longest: int,
+        lane_bytes: int = 256 * _KIB,
+        total_bytes: int = 8192 * _KIB,
+        bell: memoryview | None = None,
+    ):
         self.waiting = False
+        self._bell = memoryview(bytearray(1)) if bell is None else bell
         self.dropped = 0
         self._longest = longest
         self._lane_bytes = lane_bytes
@@ -68,6 +76,7 @@ class Inbox:
             lane.bytes += size
             self._bytes += size
         self.waiting = True
+        self._bell[0] = 1
 
     def _has_room(self, lane: _Lane, size: int) -> bool:
         if lane.bytes + size > self._lane_bytes:

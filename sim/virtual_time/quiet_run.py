@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from module_agent.firmware import tick_kernel
+from module_agent.firmware import run_kernel, tick_kernel
 from module_agent.firmware.quiet_ticks import QuietTicks
-from module_agent.firmware.tick_kernel import NOT_QUIET, QUIET, ROW_DUE
+from module_agent.firmware.run_kernel import keep_rows, keep_times
+from module_agent.firmware.tick_kernel import QUIET, ROW_DUE
 from module_agent.model.compiled import compiled_with
 from sim.geometry.pose import Array
-from sim.sensors.sensors import Integers, used_up
+from sim.sensors.sensors import used_up
 from sim.world import world_kernel
 from sim.world.truth import TruthLog
 from sim.world.world import World
@@ -52,7 +53,7 @@ class QuietRun:
         return ticks, quiet.end_run()
 
 
-@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel)
+@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel, run_kernel)
 def _run(
     state: Any,
     number: int,
@@ -71,8 +72,8 @@ def _run(
         keep_truth(own.plant, (number + done) * own.tick_ns, truth)
         tick_kernel.tick(own.integers, own.floats, *quiet)
         done += 1
-        _keep_times(own.integers, times)
-        ends = _keep_rows(results, alive, rows, room, held, held_rows)
+        keep_times(own.integers, times)
+        ends = keep_rows(results, alive, rows, room, held, held_rows)
         if ends or done >= most or used_up(own.sensors):
             break
         for i in range(len(pwm)):
@@ -82,33 +83,3 @@ def _run(
         if results[i] == QUIET and held[i] > 0:
             results[i] = ROW_DUE
     return done
-
-
-@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel)
-def _keep_times(integers: Integers, times: Integers) -> None:
-    """Keep the modules' times in this tick and the one before, (2, n)."""
-    for i in range(integers.shape[0]):
-        times[0, i] = times[1, i]
-        times[1, i] = integers[i, 0]
-
-
-@compiled_with(*world_kernel.PARTS, world_kernel, tick_kernel)
-def _keep_rows(
-    results: NDArray[np.uint8],
-    alive: NDArray[np.uint8],
-    rows: NDArray[np.uint8],
-    room: Integers,
-    held: Integers,
-    held_rows: NDArray[np.uint8],
-) -> bool:
-    """Hold the rows of this tick; return whether Python has a part in it."""
-    ends = False
-    for i in range(len(results)):
-        if results[i] == ROW_DUE:
-            for k in range(rows.shape[1]):
-                held_rows[i, held[i], k] = rows[i, k]
-            held[i] += 1
-            ends |= held[i] >= room[i]
-        elif results[i] == NOT_QUIET and alive[i]:
-            ends = True
-    return ends
