@@ -7,12 +7,18 @@ cache folder of the user if the package is read-only.
 import asyncio
 import subprocess
 import sys
+import threading
 import time
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
 
 from module_agent.model.errors import RobotError
+
+if TYPE_CHECKING:
+    from sim.robot.robot_file import Robot
 
 # Modules with kernels. A group is compiled in a process of its own.
 GROUPS = {
@@ -26,7 +32,9 @@ GROUPS = {
         "sim.sensors.sensors",
         "sim.world.world_kernel",
         "sim.virtual_time.quiet_run",
+        "sim.world.bus_server",
         "module_agent.firmware.tick_kernel",
+        "module_agent.firmware.bus_run",
     ),
     "regressor": ("module_agent.model.regressor_kernel",),
     "IMUs' readings": ("coordinator.batch_estimation.imu_kernel",),
@@ -34,6 +42,8 @@ GROUPS = {
 ROBOT = "thesis_171_horizontal"
 # Samples that are enough to fit a chain to.
 REST = 8
+# The world compiles what it needs before it serves.
+COMPILED_S = 300.0
 
 
 def compile_kernels() -> None:
@@ -70,8 +80,32 @@ def _call_world() -> None:
         readings = world.exchange([0.0] * len(robot.modules))
         world.close()
     QuietTicks(len(readings)).run(readings, busy=[])
+    _call_bus(robot)
     with virtual_robot(VirtualSettings(robot, PROFILES["none"])) as alone:
         alone.complete(asyncio.sleep(0.01))
+
+
+def _call_bus(robot: "Robot") -> None:
+    from module_agent.firmware.bus_run import BusRun
+    from module_agent.firmware.quiet_ticks import QuietTicks
+    from module_agent.hardware.bus_client import BusClient
+    from module_agent.hardware.loop_inside import LoopInside
+    from sim.world.bus_server import BusServer
+    from sim.world.truth import TruthLog
+    from sim.world.world import World
+
+    with TemporaryDirectory() as folder, BusServer(f"{folder}/bus", TruthLog(World(robot, seed=1))) as server:
+        stopping: list[bool] = []
+        serving = threading.Thread(target=server.run, args=(None, lambda: bool(stopping)))
+        serving.start()
+        try:
+            bus = BusClient(f"{folder}/bus", robot.serials, COMPILED_S)
+            loops = LoopInside(bus)
+            BusRun(loops, bus, QuietTicks(len(robot.serials)), np.zeros(1, np.uint8)).run([], 1)
+            loops.close()
+        finally:
+            stopping.append(True)
+            serving.join()
 
 
 def _call_regressor() -> None:

@@ -37,7 +37,7 @@ class _SickTruth(TruthLog):
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Step the world and return what the modules read of it."""
         readings = super().exchange(pwm)
-        return self._sensors.read(self._world.t_ns - TICK_NS, readings)
+        return self._sensors.read(self.world.t_ns - TICK_NS, readings)
 
 
 class FaultyRobot(VirtualRobot):

@@ -113,13 +113,13 @@ def read_truth(path: Path) -> Truth:
 
 
 class TruthLog:
-    """Steps a world and records its true motion, every `every` ticks."""
+    """Steps `world` and records its true motion, every `every` ticks."""
 
     def __init__(self, world: World, every: int = 4):
         if every < 1:
             raise DataError(f"every {every} ticks: at least 1")
         self.modules = world.modules
-        self._world = world
+        self.world = world
         # Ticks so far, rows so far, and every how many ticks there is a row.
         self._counts = np.array([0, 0, every])
         self._t_ns = np.zeros(_ROWS, dtype=np.int64)
@@ -127,14 +127,14 @@ class TruthLog:
 
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Step the world, record the instant of its samples if it is due, and return its readings."""
-        samples = self._world.exchange(pwm)
-        keep_truth(self._world.plant_rows, self._world.t_ns - TICK_NS, self.begin_run(1))
+        samples = self.world.exchange(pwm)
+        keep_truth(self.world.plant_rows, self.world.t_ns - TICK_NS, self.begin_run(1))
         return samples
 
     @property
     def can_run_ahead(self) -> bool:
         """Whether a kernel can do what `exchange` does, for any number of ticks."""
-        return type(self).exchange is TruthLog.exchange and self._world.can_run_ahead
+        return type(self).exchange is TruthLog.exchange and self.world.can_run_ahead
 
     def begin_run(self, ticks: int) -> tuple[Any, ...]:
         """Return arrays with room for so many ticks: times, rows, and counts, as `keep_truth` takes them."""
@@ -146,15 +146,13 @@ class TruthLog:
 
     def motion(self) -> Motion:
         """Return what has been recorded."""
-        n = len(self._world.modules)
+        n = len(self.world.modules)
         rows = int(self._counts[1])
         stamps, columns = self._t_ns[:rows].copy(), self._rows[:rows].copy()
-        clocks = [[module_time(clock, t) for clock in self._world.sensors.clocks] for t in stamps.tolist()]
+        clocks = [[module_time(clock, t) for clock in self.world.sensors.clocks] for t in stamps.tolist()]
         clock_ns = np.array(clocks, dtype=np.int64).reshape(-1, n)
         make_read_only((stamps, clock_ns, columns))
-        return Motion(
-            self._world.robot.serials, stamps, clock_ns, columns[:, 0], columns[:, 1], columns[:, 2]
-        )
+        return Motion(self.world.robot.serials, stamps, clock_ns, columns[:, 0], columns[:, 1], columns[:, 2])
 
     def save(self, path: Path) -> None:
         """Write the motion as an npz file, atomically; the fields are those of `Motion`."""
