@@ -83,7 +83,7 @@ class Motion:
         effort: the efforts that it is fed forward; without them the effort loop is off.
 
     Raises:
-        WireError: TYPES or NOT_FINITE, the efforts are no finite numbers.
+        WireError: TYPES, the efforts are no numbers; NOT_FINITE, one or a target is not finite.
     """
 
     def __init__(
@@ -92,7 +92,13 @@ class Motion:
         total_s = duration_s(pattern, origin_rad)
         steps = max(1, round(total_s * 1e9 / STEP_NS))
         t_s = np.minimum(np.arange(steps + 1) * (STEP_NS / 1e9), total_s)
-        samples = waveform(pattern, origin_rad, t_s)
+        with np.errstate(all="ignore"):
+            samples = waveform(pattern, origin_rad, t_s)
+        if not (np.isfinite(samples.offset_rad).all() and np.isfinite(samples.velocity_rad_s).all()):
+            # No comparison with a limit would hold for it.
+            raise WireError(
+                Refusal.NOT_FINITE, f"a {pattern.kind} motion of these sizes has no finite targets"
+            )
         self._position: list[float] = (origin_rad + samples.offset_rad).tolist()
         self._velocity: list[float] = samples.velocity_rad_s.tolist()
         self._effort: list[float] | None = None if effort is None else effort_at(effort, t_s).tolist()

@@ -18,6 +18,8 @@ MStopAction = Literal["disabled", "motor_off", "hold"]
 
 # At this temperature a module has no PWM left, whatever its configuration says.
 MAX_WINDING_C = 154.0
+# A winding is armed again 14 K below its limit, which a warm room must not prevent.
+MIN_WINDING_C = 60.0
 # An arm of length r that a motor can just hold level decelerates by g / r under the same torque: 10 rad/s^2
 # for a metre, of which gravity may take half.
 BRAKING_RAD_S2 = 5.0
@@ -78,7 +80,7 @@ class Safety(BaseModel):
     velocity_rad_s: _Interval = _INFINITE
     effort_nm: _Interval = _INFINITE
     current_a: Annotated[_Number, Field(gt=0.0)] = math.inf
-    winding_c: Annotated[_Number, Field(ge=30.0, le=MAX_WINDING_C)] = MAX_WINDING_C
+    winding_c: Annotated[_Number, Field(ge=MIN_WINDING_C, le=MAX_WINDING_C)] = MAX_WINDING_C
     braking_rad_s2: Annotated[_Number, Field(gt=0.0, le=1e4)] = BRAKING_RAD_S2
     m_stop: MStopAction | None = None
 

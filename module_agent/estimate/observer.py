@@ -3,8 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-
 from module_agent.estimate.circle_point_analysis import circle_estimate, circle_point_analysis, rest_reading
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.joint_regression import regress_joint, regression_estimate
@@ -104,8 +102,9 @@ class Observer:
                 regression = regress_joint(motions, still, self.knowledge)
                 delay_s = delay.delay_s + regression.delays_s[-1]
                 found = found._replace(regression=regression_estimate(regression, delay_s))
-        except (DataError, np.linalg.LinAlgError) as error:
-            # Published as a finding: it explains why there is no estimate.
+        except (DataError, ValueError, ArithmeticError, MemoryError) as error:
+            # Published as a finding: it explains why there is no estimate. The rows of others may be anything
+            # such as times that no spline takes, and must not end this process. LinAlgErrors are ValueErrors.
             why = str(error) if found.circle is None else f"no joint regression: {error}"
             found = found._replace(note=why[:512])
         return found

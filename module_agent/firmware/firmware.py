@@ -129,7 +129,7 @@ class Firmware:
         self._stopped_ns = 0
         self._announced_until_ns = 0
         # Whether the motor is off while stopped, and which limits have acted since the last status.
-        self._stopped_off = False
+        self._stopped_off = self._hot = False
         self._limited = 0
         self._expiries = 0
         self._seq = 0
@@ -161,6 +161,7 @@ class Firmware:
         if sensors.winding_temperature_c >= self.config.safety.winding_c and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", f"winding at {sensors.winding_temperature_c:.0f} C")
+            self._hot = True
         if (fault := _fault(sample)) and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", fault)
@@ -390,7 +391,9 @@ class Firmware:
         assert self._sample is not None
         winding_c = self._sample.sensors.winding_temperature_c
         cool_c = self.config.safety.winding_c - WINDING_REARM_K
-        if self.state == "fault" and winding_c > cool_c:
+        # One that was too hot cools down first; others are armed up to the limit.
+        self._hot = winding_c > cool_c if self._hot else winding_c >= self.config.safety.winding_c
+        if self._hot:
             raise WireError(Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {cool_c:.0f} C")
         if fault := _fault(self._sample):
             raise WireError(Refusal.NOT_ARMED, fault)

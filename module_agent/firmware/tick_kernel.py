@@ -173,12 +173,16 @@ def _drive(
         for k in range(3):
             _reset(memory[k])
     if braked:
-        damping = -reading[MOTOR_RATE] / own.max_motor_rad_s
+        most = -reading[MOTOR_RATE] / own.max_motor_rad_s
+        damping = most
         if damping < -DAMPING_LIMIT_PWM:
             damping = -DAMPING_LIMIT_PWM
         if damping > DAMPING_LIMIT_PWM:
             damping = DAMPING_LIMIT_PWM
-        return _limit(own, damping, integers, reading)
+        damping = _limit(own, damping, integers, reading)
+        if most < 0.0:
+            return most if damping < most else 0.0 if damping > 0.0 else damping
+        return most if damping > most else 0.0 if damping < 0.0 else damping
     integers[LIMIT] = LIMIT_NONE
     return 0.0
 

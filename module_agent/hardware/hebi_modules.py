@@ -28,6 +28,8 @@ from module_agent.wire.messages import GainSet, PidGains
 # A round trip takes 0.7 ms, 1.6 at most (measured on a real X5-1).
 FEEDBACK_TIMEOUT_MS = 20
 LOST_AFTER_S = 1.0
+# A module's clock begins anew when it boots; feedback that was overtaken is younger.
+RESTARTED_NS = 1_000_000_000
 _CONFIRM_MS, _CONFIRM_TRIES = 50, 3
 _OFF_LED, _ON_LED = (0, 0, 0, 0), (255, 0, 255, 255)
 
@@ -95,6 +97,7 @@ class HebiModules:
         self._lifetimes_ns = [250_000_000] * count
         self._readings = np.full((count, len(SensorSample._fields)), math.nan)
         self._ticks = self._missed = self._off_ticks = self._unsent = 0
+        self._new_gains: set[int] = set()
         self._closed = False
         group.feedback_frequency = 0.0
         self._apply_lifetime()
@@ -132,7 +135,7 @@ class HebiModules:
 
         Raises:
             ValueError: not one command per module, or there was no sample yet.
-            HardwareLost: commands cannot be sent for `LOST_AFTER_S`.
+            HardwareLost: commands cannot be sent for `LOST_AFTER_S`, or new gains are not confirmed.
         """
         if len(commands) != len(self._links) or not self._ticks:
             raise ValueError(
@@ -143,6 +146,8 @@ class HebiModules:
         commanded = np.isfinite(self._targets).any(axis=1)
         for index in np.flatnonzero(commanded).tolist():
             self._end_m_stop(index, commands[index])
+        if self._new_gains:
+            self._send_gains()
         active = bool(commanded.any())
         self._off_ticks = 0 if active else self._off_ticks + 1
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
@@ -151,14 +156,11 @@ class HebiModules:
         return [link.pwm for link in self._links]
 
     def set_gains(self, index: int, gains: GainSet) -> None:
-        """Replace the gains of a module until its next power cycle.
+        """Replace the gains of a module until its next power cycle, with the next command that is sent.
 
-        Raises:
-            HardwareLost: the module does not confirm them.
+        HEBI's messages have gains and targets together: sent now they would repeat targets that have expired.
         """
-        command = self._settings()
-        write_gains(command[index], gains)
-        self._confirmed(command, f"the gains of {self._links[index].serial}")
+        self._new_gains.add(index)
         self._information[index] = self._information[index]._replace(gains=gains)
 
     def set_lifetime(self, index: int, lifetime_ns: int) -> None:
@@ -224,6 +226,14 @@ class HebiModules:
             link.is_off_after_m_stop = False
             self.set_gains(index, self._information[index].gains)
 
+    def _send_gains(self) -> None:
+        command = self._settings()
+        for index in self._new_gains:
+            write_gains(command[index], self._information[index].gains)
+        names = ", ".join(self._links[index].serial for index in sorted(self._new_gains))
+        self._confirmed(command, f"the gains of {names}")
+        self._new_gains.clear()
+
     def _send_targets(self) -> None:
         self._write_targets(self._command)
         self._unsent = 0 if self._group.send_command(self._command) else self._unsent + 1
@@ -269,16 +279,22 @@ class _Link:
         self._misses = 0
         self._imu: list[float] = []
         self._last = self._check.checked(_sensors(0, 0, [math.nan] * len(SensorSample._fields)))
-        self._fault = ""
+        self._fault = "no feedback yet"
+        self._restarted = ""
 
     def with_feedback(self, t_ns: int, row: list[float], tick: int, fault: str) -> ModuleSample:
         """Return the sample of a feedback; `row` is in the order of a sample."""
         # Feedback does not say when the IMU was read: no later than when its values were first seen.
+        if self.feedback_ns - t_ns > RESTARTED_NS:
+            # What was set until its next power cycle is lost: limits, gains, gravity in the accelerometer.
+            self._restarted = (
+                f"{self.serial} has restarted without its limits and settings: start its agent anew"
+            )
         fresh, self._imu = row[_IMU] != self._imu, row[_IMU]
         imu_t_ns = t_ns if fresh else min(self._last.imu_t_ns, t_ns)
         self.feedback_ns, self._sequence, self._misses = t_ns, tick, 0
         self._last = self._check.checked(_sensors(t_ns, imu_t_ns, row))
-        self._fault = self._check.fault or fault
+        self._fault = self._restarted or self._check.fault or fault
         return self._sample(self._fault)
 
     def without_feedback(self) -> ModuleSample:

@@ -193,7 +193,10 @@ def restrict(
             raise UsageError(f"module {module.serial}: a real module has no limit {', '.join(others)}")
     limits = [one.tightened(module.limits) for module, one in zip(information, safety, strict=True)]
     command = hebi.GroupCommand(group.size)
-    written = [dict(_settings(one, own)) for one, own in zip(safety, limits, strict=True)]
+    written = [
+        dict(_settings(one, own, module.limits))
+        for module, one, own in zip(information, safety, limits, strict=True)
+    ]
     for index, settings in enumerate(written):
         for name, value in settings.items():
             setattr(command[index], name, value)
@@ -210,10 +213,10 @@ def restrict(
     ]
 
 
-def _settings(safety: Safety, limits: Limits) -> Iterator[tuple[str, float]]:
+def _settings(safety: Safety, limits: Limits, before: Limits) -> Iterator[tuple[str, float]]:
     """Yield HEBI's names and values of the limits of a module that are narrower than its own.
 
-    limits: the module's, tightened by `safety`.
+    limits: the module's, tightened by `safety`; before: as the module has them.
     """
     own = limits.min_position_rad, limits.max_position_rad
     for side, limit, action, tight in zip(
@@ -223,8 +226,8 @@ def _settings(safety: Safety, limits: Limits) -> Iterator[tuple[str, float]]:
             yield f"position_limit_{side}", limit
             yield f"{side}_position_limit_strategy", AT_LIMIT[action]
     for name, both, most in (
-        ("velocity", safety.velocity_rad_s, limits.max_speed_rad_s),
-        ("effort", safety.effort_nm, limits.max_effort_nm),
+        ("velocity", safety.velocity_rad_s, before.max_speed_rad_s),
+        ("effort", safety.effort_nm, before.max_effort_nm),
     ):
         for side, limit in zip(("min", "max"), both, strict=True):
             if math.isfinite(limit):

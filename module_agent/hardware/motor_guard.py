@@ -172,8 +172,12 @@ class MotorGuard:
         It follows the motor's speed and not the output's, which is behind a spring: feeding that back drives
         an oscillation (25 Hz and 2.6 rad/s on an X5-9 with an arm of 0.5 kg).
         """
-        pwm = -sample.motor_velocity_rad_s / self.bounds.max_motor_rad_s
-        return self.limit(min(max(pwm, -DAMPING_LIMIT_PWM), DAMPING_LIMIT_PWM), sample)
+        most = -sample.motor_velocity_rad_s / self.bounds.max_motor_rad_s
+        pwm = self.limit(min(max(most, -DAMPING_LIMIT_PWM), DAMPING_LIMIT_PWM), sample)
+        # Before a limit it brakes harder; beyond one it does not drive back: it only ever opposes the motion.
+        if most < 0.0:
+            return most if pwm < most else 0.0 if pwm > 0.0 else pwm
+        return most if pwm > most else 0.0 if pwm < 0.0 else pwm
 
     def _distances(self, sample: SensorSample) -> tuple[float, float, float]:
         """Return the motor's speed at the output, and the distances to the lower and the upper limit."""

@@ -9,12 +9,21 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import EXPLORATION_KINDS, Feedback, MotionRecord, Status
+from module_agent.wire.messages import (
+    EXPLORATION_KINDS,
+    MAX_BATCH_ROWS,
+    MAX_ROWS_PER_MOTION,
+    Feedback,
+    MotionRecord,
+    Status,
+)
 from module_agent.wire.refusal import Refusal, WireError
 from module_agent.wire.row_log import RowLog
 
 ANSWER_TIMEOUT_NS = 400_000_000
 GIVE_UP_NS = 5_000_000_000
+# One that moves its joints in a session is heard of more often; after this its place may be another's.
+FORGET_NS = 60_000_000_000
 ROWS_PER_QUESTION = 256
 # Modules, and boots of them, whose announcements are remembered; more than any robot has.
 MAX_MODULES, MAX_BOOTS = 256, 1024
@@ -98,6 +107,7 @@ class MotionListener:
         self._finished: dict[str, tuple[int, int]] = {}
         self._actions: list[Action] = []
         self._boot: dict[str, int] = {}
+        self._heard_ns: dict[str, int] = {}
         self._newest: dict[tuple[str, int], int] = {}
 
     def _is_outdated(self, status: Status) -> bool:
@@ -105,13 +115,22 @@ class MotionListener:
         newest = self._newest.get((status.serial, status.boot))
         if newest is not None and (self._boot[status.serial] != status.boot or status.seq <= newest):
             return True
-        self._boot[status.serial] = status.boot
         # The latest last, so that what is forgotten was not heard of for the longest time.
+        self._boot.pop(status.serial, None)
+        self._boot[status.serial] = status.boot
         self._newest.pop((status.serial, status.boot), None)
         self._newest[status.serial, status.boot] = status.seq
         if len(self._newest) > MAX_BOOTS:
             del self._newest[next(iter(self._newest))]
         return False
+
+    def _forget_one(self, now_ns: int) -> bool:
+        """Forget the module that was not heard of for the longest time, if that is long and it rests."""
+        serial = next(iter(self._boot))
+        if serial in self._tracks or now_ns - self._heard_ns[serial] < FORGET_NS:
+            return False
+        del self._boot[serial], self._heard_ns[serial]
+        return True
 
     def on_status(self, status: Status, now_ns: int, own_ns: Mapping[str, int]) -> None:
         """Take notice of a status; `now_ns` is any one steady clock of this process.
@@ -119,10 +138,12 @@ class MotionListener:
         Raises:
             WireError: LIMIT, it is of one module too many.
         """
-        if status.serial not in self._boot and len(self._boot) >= MAX_MODULES:
+        is_full = status.serial not in self._boot and len(self._boot) >= MAX_MODULES
+        if is_full and not self._forget_one(now_ns):
             raise WireError(Refusal.LIMIT, f"{status.serial} is one module more than {MAX_MODULES}")
         if self._is_outdated(status):
             return
+        self._heard_ns[status.serial] = now_ns
         self.has_work = True
         record = status.motion
         if record is None or record.pattern.kind not in EXPLORATION_KINDS:
@@ -149,6 +170,10 @@ class MotionListener:
         """Keep rows; `live` says that they were published, so that their arrival bounds the clock offset."""
         track = self._tracks.get(feedback.serial)
         if track is None or track.boot != feedback.boot:
+            return
+        # A motion without an end yet has at most as many rows as one that has ended.
+        first = track.record.start_row
+        if not first - MAX_BATCH_ROWS < feedback.first_row < first + MAX_ROWS_PER_MOTION:
             return
         self.has_work = True
         rows = track.log.add(feedback)

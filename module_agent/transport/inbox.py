@@ -2,14 +2,20 @@
 
 import threading
 from collections import deque
+from itertools import islice
 
 from module_agent.transport.transport import Event, Liveness, Reply
 
-# What an event takes besides its payload: short messages must not be free.
+# What an event takes besides its key and payload: short messages must not be free.
 EVENT_BYTES = 200
 _KIB = 1024
 
 Name = tuple[type[Event], str]
+
+
+def _size(event: Event) -> int:
+    payload = b"" if isinstance(event, Liveness) else event.payload
+    return EVENT_BYTES + len(event.key) + len(payload or b"")
 
 
 class _Lane:
@@ -58,11 +64,9 @@ class Inbox:
 
     def put(self, event: Event, stamp: int = 0) -> None:
         """Enqueue from any thread, with a stamp that comes out with it; never blocks for long."""
-        size = EVENT_BYTES
-        if not isinstance(event, Liveness) and event.payload is not None:
-            if len(event.payload) > self._longest:
-                event = event._replace(payload=event.payload[: self._longest + 1])
-            size += len(event.payload or b"")
+        if not isinstance(event, Liveness) and event.payload and len(event.payload) > self._longest:
+            event = event._replace(payload=event.payload[: self._longest + 1])
+        size = _size(event)
         name = type(event), event.key
         with self._lock:
             lane = self._lanes.get(name)
@@ -92,31 +96,31 @@ class Inbox:
 
     def _take(self, lane: _Lane, newest: bool = False) -> tuple[int, int, Event]:
         item = lane.events.pop() if newest else lane.events.popleft()
-        event = item[2]
-        payload = b"" if isinstance(event, Liveness) else event.payload
-        size = EVENT_BYTES + len(payload or b"")
+        size = _size(item[2])
         lane.bytes -= size
         self._bytes -= size
         return item
 
     def drain_stamped(self, limit: int) -> list[tuple[int, Event]]:
-        """Take about `limit` events with their stamps in order of arrival, of every key its share."""
+        """Take at most `limit` events with their stamps in order of arrival, of every key its share."""
         # Before the look: what arrives after it sets it again.
         self.waiting = False
         taken: list[tuple[int, int, Event]] = []
         with self._lock:
             share = max(1, limit // max(1, len(self._lanes)))
-            for name, lane in list(self._lanes.items()):
+            # Those that were taken from go to the end, so that many keys have their turns.
+            for name in list(islice(self._lanes, limit)):
+                lane = self._lanes.pop(name)
                 taken += [self._take(lane) for _ in range(min(share, len(lane.events)))]
-                if not lane.events:
-                    del self._lanes[name]
+                if lane.events:
+                    self._lanes[name] = lane
             if self._lanes:
                 self.waiting = True
         taken.sort(key=lambda item: item[0])
         return [(stamp, event) for _, stamp, event in taken]
 
     def drain(self, limit: int = 64) -> list[Event]:
-        """Take about `limit` events in order of arrival, of every key its share."""
+        """Take at most `limit` events in order of arrival, of every key its share."""
         return [event for _, event in self.drain_stamped(limit)]
 
     def __len__(self) -> int:

@@ -23,9 +23,12 @@ from module_agent.wire.messages import (
     LeaseRequest,
     Message,
     MotionCommand,
+    MultiSine,
     Rest,
+    Sine,
+    WindowedSine,
 )
-from module_agent.wire.refusal import Refusal
+from module_agent.wire.refusal import Refusal, WireError
 from tests.module_agent.wired_firmware import WiredFirmware
 
 MS = 1_000_000
@@ -126,6 +129,18 @@ def test_efforts_that_are_no_numbers_are_refused_and_nothing_moves(
     ack = module.move(EffortProfile(period_ns=10 * MS, samples=samples))
     assert (ack.accepted, ack.reason, ack.detail) == (False, reason.value, detail)
     assert module.firmware.state == "armed"
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=1e-3, sigma_s=5e-324),
+        MultiSine(sines=(Sine(amplitude_rad=0.1, frequency_hz=1.0),), duration_s=5e-324),
+    ],
+)
+def test_a_motion_that_computes_to_no_number_is_refused(pattern: Any) -> None:
+    with pytest.raises(WireError, match="no finite targets"):
+        Motion(pattern, 0.0, 0)
 
 
 @pytest.mark.parametrize("tick_ns", [1 * MS, 4 * MS, 2_700_001])

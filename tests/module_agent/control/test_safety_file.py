@@ -214,7 +214,7 @@ ANY = st.builds(
     velocity_rad_s=INTERVALS,
     effort_nm=INTERVALS,
     current_a=SIZES,
-    winding_c=st.floats(30.0, 154.0),
+    winding_c=st.floats(60.0, 154.0),
     braking_rad_s2=st.floats(0.1, 100.0),
     m_stop=st.sampled_from([None, "disabled", "motor_off", "hold"]),
 )

@@ -178,6 +178,7 @@ def test_every_gain_arrives_as_it_was_given(bench: Bench) -> None:
     )
     gains = gains.model_copy(update={"position": loop, "effort": loop})
     bench.driver.set_gains(LAST, gains)
+    bench.ticks(1)
     assert bench.module.gains.strategy == 2
     assert bench.module.gains.position == loop
     assert bench.module.gains.effort == loop
@@ -280,6 +281,37 @@ def test_limits_of_a_file_are_enforced_by_the_module_itself(bench: Bench) -> Non
     # Ten rad away is where it is sent to. The speed's loop overshoots by less than a quarter.
     assert max(speeds) < 1.25 * 0.4
     assert 0.2 < max(positions) < 0.3
+
+
+def test_different_limits_of_both_directions_are_written_as_they_are(bench: Bench) -> None:
+    restrict(bench, LIMITED)
+    assert bench.module._safety.velocity_rad_s == pytest.approx((-1.0, 0.4))
+    assert bench.module._safety.effort_nm == pytest.approx((-2.0, 1.5))
+
+
+def test_a_module_that_was_never_heard_has_a_fault(bench: Bench) -> None:
+    driver = bench.open(bench.group)
+    bench.module.silent = True
+    assert driver.receive()[LAST].fault == "no feedback yet"
+
+
+def test_a_module_that_boots_anew_is_a_fault_since_what_was_set_in_it_is_lost(bench: Bench) -> None:
+    bench.pass_ticks(2000)
+    bench.ticks(2)
+    link = bench.driver._links[LAST]
+    link.feedback_ns += 2_000_000_000
+    assert "X-00010 has restarted without its limits" in bench.tick().fault
+    assert "has restarted" in bench.tick().fault
+
+
+def test_gains_are_sent_with_the_next_targets_and_repeat_none_that_are_over(bench: Bench) -> None:
+    """When a command expires the gains are set anew: the old target must not come with them."""
+    bench.ticks(3, FORWARD)
+    bench.driver.set_gains(LAST, default_gains(bench.module._kind, 2))
+    bench.driver.receive()
+    bench.driver.send([MOTOR_OFF, MOTOR_OFF])
+    assert bench.module.gains.strategy == 2
+    assert max(bench.pass_ticks(3)) == 0.0
 
 
 def test_a_narrower_limit_of_the_module_stays(bench: Bench) -> None:

@@ -171,8 +171,11 @@ def test_a_target_of_nan_switches_its_loop_off(modules: Modules, strategy: int) 
     modules.send([MOTOR_OFF] * 2)
     use(modules, strategy)
     position_only = drive(modules, Command(here + 0.05, NAN, NAN))
+    # At rest again, so that the speed that is left does not decide.
+    drive(modules, BRAKE, 200)
     use(modules, strategy)
     velocity_only = drive(modules, Command(NAN, 0.1, NAN))
+    drive(modules, BRAKE, 200)
     use(modules, strategy)
     effort_only = drive(modules, Command(NAN, NAN, 0.2))
     assert min(position_only, velocity_only, effort_only) > 0.0

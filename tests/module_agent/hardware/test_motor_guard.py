@@ -334,6 +334,16 @@ def test_the_brake_is_bounded_like_any_command() -> None:
     assert guard(position_rad=RANGE).damping(reading(q=-0.45, speed=-1.4)) > DAMPING_LIMIT_PWM
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_stopped_joint_beyond_its_limit_is_braked_and_not_driven_back(sign: float) -> None:
+    out = guard(position_rad=(-0.5, 0.5))
+    assert out.damping(reading(q=sign * 1.2)) == 0.0
+    # Outward it is braked, as hard as its speed asks for at most; on its way back it is not driven on.
+    assert -1.0 <= sign * out.damping(reading(q=sign * 1.2, speed=sign * 0.3)) < 0.0
+    assert sign * out.damping(reading(q=sign * 1.2, speed=-sign * 0.3)) >= 0.0
+    assert abs(out.damping(reading(q=sign * 1.2, speed=sign * 1e-3))) < 1e-3
+
+
 # ------------------------------------------------------------------ whatever comes
 
 ANY = st.floats(-1e6, 1e6)

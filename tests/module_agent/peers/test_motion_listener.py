@@ -3,11 +3,13 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.peers.motion_listener import (
     ANSWER_TIMEOUT_NS,
+    FORGET_NS,
     GIVE_UP_NS,
     MAX_BOOTS,
     MAX_MODULES,
@@ -19,7 +21,16 @@ from module_agent.peers.motion_listener import (
     MotionListener,
 )
 from module_agent.wire.feedback_rows import ROW
-from module_agent.wire.messages import ConstantMotion, Feedback, GoTo, MotionRecord, Pattern, Status
+from module_agent.wire.messages import (
+    MAX_BATCH_ROWS,
+    MAX_ROWS_PER_MOTION,
+    ConstantMotion,
+    Feedback,
+    GoTo,
+    MotionRecord,
+    Pattern,
+    Status,
+)
 from module_agent.wire.refusal import WireError
 
 MS = 1_000_000
@@ -333,3 +344,27 @@ def test_modules_and_boots_that_were_made_up_are_remembered_up_to_a_bound() -> N
     # A module that was heard of before is heard on.
     listener.on_status(_status(_record(2), seq=9, boot=5001), 0, OWN)
     assert listener._tracks["J"].record.motion_id == 2
+
+
+def test_modules_that_were_made_up_do_not_keep_others_out_for_ever() -> None:
+    listener = MotionListener()
+    for number in range(MAX_MODULES):
+        listener.on_status(_status(_record(end=None), serial=f"M{number}"), 0, OWN)
+    with pytest.raises(WireError, match="J is one module more"):
+        listener.on_status(_status(_record()), 1, OWN)
+    listener.poll(FORGET_NS)
+    listener.on_status(_status(_record()), FORGET_NS, OWN)
+    assert "J" in listener._tracks
+    assert len(listener._boot) == len(listener._heard_ns) == MAX_MODULES
+
+
+def test_of_a_motion_without_an_end_no_more_rows_are_kept_than_of_any_other() -> None:
+    listener = MotionListener()
+    listener.on_status(_status(_record(start=1000, end=None, outcome="running")), 0, OWN)
+    track = listener._tracks["J"]
+    first = track.record.start_row
+    for far in (first + MAX_ROWS_PER_MOTION, first - MAX_BATCH_ROWS, 2**60):
+        listener.on_feedback(_feedback(far), OWN)
+    assert track.log.first_row == track.log.end_row
+    listener.on_feedback(_feedback(first), OWN)
+    assert track.log.end_row > first
