@@ -89,6 +89,8 @@ class _Cause(NamedTuple):
 
 
 _AIMS: dict[FindingKind, Aim] = {"wear": "links", "unexplained": "links", "payload": "load"}
+# A displacement that is known worse than that is no reason to move a robot: a limp arm that swings shows it.
+MAX_LINK_SIGMA_MM = 5.0
 _NEVER_NS = -(1 << 62)
 
 
@@ -238,7 +240,7 @@ class Attendant:
                     del self._lasting[finding.key]
                     say.append("the payload is gone again")
                 continue
-            if aim is None or finding.until_ns is not None:
+            if aim is None or finding.until_ns is not None or _is_vague(finding):
                 continue
             # Of a robot with other modules the monitor's model says nothing.
             if self._structure or seen.t_ns < self._answered_ns.get(of, _NEVER_NS):
@@ -294,6 +296,11 @@ def _structure_texts(gone: Sequence[str], new: Sequence[str]) -> tuple[str, ...]
     if len(gone) == len(new) == 1:
         return (f"module {gone[0]} was exchanged for {new[0]}",)
     return (*(f"module {serial} has gone" for serial in gone), *(f"module {serial} is new" for serial in new))
+
+
+def _is_vague(finding: Finding) -> bool:
+    """Return whether motions have shown too little of a displaced link; errors of IMUs pass for it then."""
+    return finding.kind == "wear" and finding.sigma > MAX_LINK_SIGMA_MM
 
 
 def _named(serials: Sequence[str]) -> str:

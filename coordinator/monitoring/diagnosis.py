@@ -37,8 +37,6 @@ from module_agent.model.regressor import PER_BODY
 MIN_SHIFT_M, MIN_TURN_RAD = 3e-3, 3e-3
 # The same under a payload, under which links give by more.
 LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
-# Where a displacement is not known to this, motions show too little of it: it is errors of the sensors.
-MAX_SHIFT_SIGMA_M = 5e-3
 # A robot is moved when one of its joints is faster than that.
 MOVING_RAD_S = 0.02
 # Friction changes by more than that with the weather.
@@ -155,8 +153,6 @@ def _link(
     length = float(np.linalg.norm(shift))
     slope = np.array([shift / max(length, 1e-9) @ displacement(chain, child, unit)[1] for unit in np.eye(6)])
     sigma, angle = float(np.sqrt(slope @ best.covariance @ slope)), float(np.linalg.norm(turn))
-    if sigma > MAX_SHIFT_SIGMA_M:
-        return None
     min_shift, min_turn = (LOADED_SHIFT_M, LOADED_TURN_RAD) if loaded else (MIN_SHIFT_M, MIN_TURN_RAD)
     if length < min_shift + 2.0 * sigma and angle < min_turn:
         return None

@@ -145,6 +145,13 @@ def test_what_the_monitor_finds_is_measured_if_it_stays(kind: Kind, aim: str, af
     assert measured.why == (f"a {kind} at wrist",)
 
 
+def test_a_link_that_motions_hardly_show_is_no_reason_to_move() -> None:
+    story = Story()
+    story.findings = [found("wear", 0.0).model_copy(update={"size": 323.0, "sigma": 46.0})]
+    assert story.goes_on(300.0) is None
+    assert not story.said
+
+
 @pytest.mark.parametrize("kind", ["collision", "friction"])
 def test_blows_and_stiff_gears_are_no_reason_to_move(kind: Kind) -> None:
     story = Story()
