@@ -8,7 +8,8 @@ from typing import Any
 from numba.core.dispatcher import Dispatcher
 
 import sim
-from module_agent.firmware import tick_kernel
+from module_agent.firmware import run_kernel, tick_kernel
+from module_agent.hardware import bus_client, packet_kernel
 from sim.commands.compile import GROUPS, call_kernels
 from sim.robot.robot_file import load_robot
 from sim.world import world_kernel
@@ -44,7 +45,8 @@ def test_a_run_needs_no_other_signatures() -> None:
     before = signatures()
     compiled = {name.rpartition(".")[0] for name, types in before.items() if types}
     # Machine code that is kept has that of the parts in it, which are not loaded then.
-    parts = {part.__name__ for part in (*PARTS, world_kernel, tick_kernel)}
+    on_bus = run_kernel, bus_client, packet_kernel
+    parts = {part.__name__ for part in (*PARTS, world_kernel, tick_kernel, *on_bus)}
     assert compiled | parts == {module for group in GROUPS.values() for module in group}
     robot = load_robot("arm6")
     push = Push(serial=robot.modules[-1].serial, force_n=(0.0, 0.0, -1.0), for_s=1.0)
