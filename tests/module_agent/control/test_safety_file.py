@@ -281,6 +281,18 @@ def test_the_narrower_of_the_types_and_the_owners_limits_holds() -> None:
     assert Safety(velocity_rad_s=9e9, effort_nm=9e9).tightened(snake) == snake
 
 
+@pytest.mark.parametrize("effort_nm", [(-1.0, 2.0), (-2.0, 1.0)])
+def test_the_effort_that_is_possible_in_both_directions_is_the_smaller_one(
+    effort_nm: tuple[float, float],
+) -> None:
+    assert Safety(effort_nm=effort_nm).tightened(catalogue_limits(CATALOGUE["X5-9"])).max_effort_nm == 1.0
+
+
+def test_a_range_that_meets_the_types_in_one_point_is_refused() -> None:
+    with pytest.raises(UsageError, match="no position is allowed"):
+        Safety(position_rad=(1.5708, 3.0)).tightened(catalogue_limits(CATALOGUE["SEA-snake"]))
+
+
 def test_a_range_outside_of_the_types_is_refused() -> None:
     with pytest.raises(UsageError, match=r"-1\.5708 \.\. 1\.5708"):
         Safety(position_rad=(2.0, 3.0)).tightened(catalogue_limits(CATALOGUE["SEA-snake"]))

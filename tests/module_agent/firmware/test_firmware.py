@@ -906,6 +906,13 @@ def test_an_answer_names_the_command_that_was_taken_and_a_refusal_its_reason() -
     assert (answer.re, answer.reason) == (0, "limit")
 
 
+def test_messages_are_counted_one_by_one_and_a_status_names_its_question() -> None:
+    question = Incoming(Leaf.STATUS, encode(Ask(serial="A", boot=0, seq=9, sender="me")), 1)
+    first, second = (decode(Status, answer) for answer in Bench().tick(question, question))
+    assert second.seq == first.seq + 1
+    assert (first.re, second.re) == (9, 9)
+
+
 def test_a_long_story_is_cut_to_what_a_message_holds() -> None:
     head = {"serial": "A", "boot": BOOT, "seq": 1}
     answer = acknowledgement(head, Lease(), 0, 1, WireError(Refusal.LIMIT, 600 * "x"))
@@ -933,6 +940,7 @@ def test_at_the_first_nanoseconds_a_clock_is_a_clock() -> None:
     sample = SensorSample(0, 0, *(0.0,) * 6, 40.0, 24.0, *(0.0,) * 6)  # type: ignore[call-arg]
     _, out = wired.tick(sample)
     assert Leaf.STATUS in [o.leaf for o in out if isinstance(o, Publication)]
+    assert wired.firmware.state == "idle"
     acquire = encode(LeaseRequest(**rest.head(action="acquire", token=0, echo_ns=0)))
     wired.tick(sample._replace(t_ns=1), [Incoming(Leaf.LEASE, acquire, None)])
     assert wired.firmware.state == "armed"

@@ -167,6 +167,24 @@ def test_readings_in_a_block_of_memory_are_handed_on_as_they_are() -> None:
     assert bench.modules.exchange([0.0]) is block
 
 
+def test_a_fresh_module_is_clean_and_does_nothing() -> None:
+    bench = Bench()
+    sample = bench.receive()
+    assert (sample.m_stop, sample.fault, bench.modules.identified) == (False, "", ())
+    assert sample.m_stop is False
+    for command, running in (
+        (MOTOR_OFF, False),
+        (PUSH, True),
+        (MOTOR_OFF, False),
+        (PUSH, True),
+        (BRAKE, False),
+    ):
+        bench.modules.send([command])
+        assert bench.modules.quiet_state(0).running is running
+        bench.receive()
+    assert Bench().modules.quiet_state(0)[1:5] == (False, False, 0, 0.0)
+
+
 def test_a_module_goes_on_from_what_a_quiet_tick_has_left_of_it() -> None:
     bench = Bench()
     bench.drive(PUSH)
@@ -210,6 +228,7 @@ def test_there_is_one_command_per_module_after_a_first_sample() -> None:
 def test_a_lifetime_is_positive(lifetime_ns: int) -> None:
     with pytest.raises(ValueError, match="it must be over 0"):
         Bench().modules.set_lifetime(0, lifetime_ns)
+    Bench().modules.set_lifetime(0, 1)
 
 
 def test_a_lifetime_is_that_of_its_module() -> None:

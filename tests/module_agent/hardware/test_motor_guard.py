@@ -175,6 +175,16 @@ def test_a_motor_is_off_shortly_before_its_limit_where_it_arrives_slowly(sign: f
     assert limiter.fault == ""
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_motor_is_off_from_exactly_twice_its_margin_before_the_limit(sign: float) -> None:
+    # A range of an eighth has a margin of a 64th: all distances are exact.
+    limiter = guard(position_rad=(-0.0625, 0.0625), at_limit="motor_off")
+    assert limiter.fault == ""
+    assert driven(limiter, 0.0, reading(q=sign * 0.03124))[1] is LimitState.NONE
+    assert driven(limiter, -sign * 0.3, reading(q=sign * 0.03125)) == (0.0, LimitState.POSITION)
+    assert limiter.fault != ""
+
+
 @pytest.mark.parametrize(
     ("at_limit", "position"), [(("motor_off", "hold"), -0.6), (("hold", "motor_off"), 0.6)]
 )

@@ -27,6 +27,7 @@ MOST = dict(
 def test_a_good_sample_is_itself() -> None:
     check = SampleCheck(KIND)
     assert not check.is_clean
+    assert check.fault == ""
     assert check.checked(GOOD) is GOOD
     assert (check.is_clean, check.fault) == (True, "")
 
