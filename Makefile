@@ -31,7 +31,7 @@ $(BIN)/python:
 $(STAMP): pyproject.toml | $(BIN)/python
 	@echo "Installing the programs into $(VENV): one to two minutes, about 1.4 GB."
 	@$(PIP) -e '.[all]'
-	@echo "Compiling the numerical kernels, once: about 10 seconds."
+	@echo "Compiling the numerical kernels, once: about a minute."
 	@$(BIN)/x5-sim compile
 	@touch $@
 

@@ -22,7 +22,8 @@ from sim.hebi_stand_in import on_bus
 from sim.physics.engine import Physics
 from sim.robot.noise_choice import NoiseChoice
 
-START_TIMEOUT_S = 30.0
+# A first start without `x5-sim compile` compiles for over a minute.
+START_TIMEOUT_S = 240.0
 STOP_TIMEOUT_S = 5.0
 WATCH_S = 0.1
 LOGS = "logs"
