@@ -215,7 +215,7 @@ def _usage_errors() -> Iterator[None]:
         yield
     except (RobotError, OSError) as error:
         typer.echo(f"x5-agent: {error}", err=True)
-        raise typer.Exit(EXIT_USAGE) from error
+        raise typer.Exit(EXIT_LOST if isinstance(error, HardwareLost) else EXIT_USAGE) from error
 
 
 def _run(

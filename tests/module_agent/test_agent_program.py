@@ -95,6 +95,16 @@ def test_modules_on_hebis_network_are_listed_by_family_and_name(
     ]
 
 
+def test_modules_that_do_not_answer_at_the_start_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    def silent(options: object) -> None:
+        raise HardwareLost("a module does not tell its settings within 1000 ms")
+
+    monkeypatch.setattr("module_agent.main.open_modules", silent)
+    done = CliRunner().invoke(app, ["--hebi", "--family", "arm"])
+    assert done.exit_code == EXIT_LOST
+    assert "does not tell its settings" in done.output
+
+
 def test_a_port_that_somebody_else_has_is_named_and_not_waited_for() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

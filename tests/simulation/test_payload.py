@@ -16,6 +16,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import EXIT_USAGE
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.cases.link_change import known_robot
 from sim.geometry.link_parts import FreePose
@@ -122,8 +123,8 @@ def test_a_run_without_inertia_is_no_robot_to_compare_with(
     with pytest.raises(PayloadError, match="no motions for inertia"):
         search_payload(later, known)
     done = CliRunner().invoke(app, ["payload", str(later.folder), "--measured", str(known.folder)])
-    assert done.exit_code == 1
-    assert CliRunner().invoke(app, ["payload", str(known.folder)]).exit_code == 2
+    assert done.exit_code == EXIT_USAGE
+    assert CliRunner().invoke(app, ["payload", str(known.folder)]).exit_code == EXIT_USAGE
 
 
 def test_the_load_is_where_the_file_says() -> None:
