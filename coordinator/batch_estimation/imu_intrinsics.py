@@ -19,7 +19,7 @@ Index = NDArray[np.int64]
 # One IMU's errors as one vector: E of the gyro and of the accelerometer row by row, their biases, the delay,
 # and the gyro's sensitivity to specific force row by row.
 SIZE = 34
-_GYRO, _ACCEL, DELAY, _FORCE = slice(0, 9), slice(9, 18), 24, slice(25, 34)
+_GYRO, _ACCEL, DELAY, FORCE = slice(0, 9), slice(9, 18), 24, slice(25, 34)
 GYRO_BIAS, ACCEL_BIAS = slice(18, 21), slice(21, 24)
 _NAMES = (
     (_GYRO, "an error of its gyro's scale or axes", ""),
@@ -27,7 +27,7 @@ _NAMES = (
     (GYRO_BIAS, "the bias of its gyro", "rad/s"),
     (ACCEL_BIAS, "the bias of its accelerometer", "m/s^2"),
     (slice(DELAY, DELAY + 1), "the delay of its IMU", "s"),
-    (_FORCE, "the answer of its gyro to a specific force", "s/m"),
+    (FORCE, "the answer of its gyro to a specific force", "s/m"),
 )
 
 
@@ -59,7 +59,7 @@ class ImuIntrinsics(NamedTuple):
     @property
     def g_sensitivity_s_m(self) -> Array:
         """What a specific force adds to the gyros' rates, (n, 3, 3) [rad/s per m/s^2]."""
-        return self.errors[:, _FORCE].reshape(-1, 3, 3)
+        return self.errors[:, FORCE].reshape(-1, 3, 3)
 
 
 def beyond(intrinsics: ImuIntrinsics, prior: ImuPrior) -> Array:
@@ -128,6 +128,6 @@ def axis_slopes(gyro: Array, accel: Array, rates: Array | None, axis: int) -> tu
     if rates is not None:
         parts.append(([DELAY], -rates[:, axis][None]))
     if axis < 3:
-        parts.append((_FORCE.start + matrix, accel.T))
+        parts.append((FORCE.start + matrix, accel.T))
     errors, derivatives = zip(*parts, strict=True)
     return np.concatenate(errors), np.concatenate(derivatives)

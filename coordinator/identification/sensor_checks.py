@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.batch_estimation.estimator import SYSTEMATIC, Refinement
-from coordinator.batch_estimation.imu_intrinsics import error_name
+from coordinator.batch_estimation.imu_intrinsics import FORCE, error_name
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.finding import Finding, SensorError, Sickness
@@ -322,17 +322,21 @@ def poor_imus(refined: Refinement, prior: ImuPrior) -> list[Finding]:
 
     The fit takes such an error for the IMU's own only as far as the prior allows, and the rest for the
     robot's: a place or an axis may be wrong beyond its claim. What links and bases that give leave here is
-    below `SERIOUS_ABOVE`, and a note.
+    below `SERIOUS_ABOVE`, but in the gyro's answer to a force: a link that bends turns its IMU with the force
+    on it. That alone is not serious.
     """
     free, findings = prior.sigmas > 0.0, []
     off = np.abs(refined.intrinsics.errors[:, free] / prior.sigmas[free])
     for serial, sigmas, errors in zip(refined.chain.serials, off, refined.intrinsics.errors, strict=True):
+        bends = (FORCE.start <= np.flatnonzero(free)) & (np.flatnonzero(free) < FORCE.stop)
+        serious = bool((sigmas[~bends] > SERIOUS_ABOVE).any())
+        sigmas = np.where(bends, 0.0, sigmas) if serious else sigmas
         worst, most = int(np.flatnonzero(free)[sigmas.argmax()]), float(sigmas.max())
         if most > SERIOUS_ABOVE:
             what, unit = error_name(worst)
             size = float(errors[worst])
             findings.append(
-                Finding(serial, EXPLORATION, what, size, 0.0, most, unit, _POOR, "imu_error", True)
+                Finding(serial, EXPLORATION, what, size, 0.0, most, unit, _POOR, "imu_error", serious)
             )
     return findings
 

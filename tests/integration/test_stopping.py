@@ -86,6 +86,8 @@ def test_a_run_whose_output_nothing_reads_any_more_ends_as_with_a_closed_termina
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        # Started by nohup it would outlive its terminal.
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     )
     assert run.stderr is not None
     # Before it has found the modules there is nothing to stop.

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.batch_estimation.imu_intrinsics import ACCEL_BIAS, ImuIntrinsics, error_name
+from coordinator.batch_estimation.imu_intrinsics import ACCEL_BIAS, FORCE, ImuIntrinsics, error_name
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.finding import SensorError
@@ -156,6 +156,18 @@ def test_an_imu_whose_errors_no_make_has_is_named() -> None:
     assert finding.summary.startswith("C: the bias of its accelerometer is -0.318 m/s^2 in its exploration")
     # As delivered, 0.2 m/s^2 are usual.
     assert poor_imus(refined, UNCALIBRATED) == []
+
+
+def test_a_gyro_that_answers_to_force_may_sit_on_a_link_that_bends() -> None:
+    errors = np.zeros((2, 34))
+    errors[:, FORCE] = 0.1
+    errors[1, ACCEL_BIAS] = 0.3
+    refined: Any = SimpleNamespace(
+        chain=SimpleNamespace(serials=("A", "B")), intrinsics=ImuIntrinsics(errors)
+    )
+    bends, sick = poor_imus(refined, CALIBRATED)
+    assert (bends.serial, bends.serious, sick.serious) == ("A", False, True)
+    assert "the bias of its accelerometer" in sick.summary
 
 
 def test_every_error_of_an_imu_has_a_name() -> None:
