@@ -50,9 +50,9 @@ _MAX_F4 = float(np.finfo(np.float32).max)
 # a message of 5 rows, and this 0.2 us a row.
 _MEASURED = ("position_rad", "velocity_rad_s", "effort_nm", "gyro_rad_s", "accel_m_s2")
 _MEASURED_PACKING = struct.Struct("<21x d 2f 40x 6f")
-_TIMES_PACKING = struct.Struct(f"<2Q {ROW.itemsize - 16}x")
-# Differences of two times, and sums of a time and a clock's offset, are in the range of 64 bits: 73 years.
-MAX_T_NS = 2**61
+_TIMES_PACKING = struct.Struct(f"<2q {ROW.itemsize - 16}x")
+# Differences of two times, and sums of a time and a clock's offset, are in the range of 64 bits.
+MAX_T_NS = 2**62 - 1
 
 
 def pack_row(ring: bytearray, slot: int, values: Sequence[float]) -> None:
@@ -72,8 +72,8 @@ def unpack(feedback: Feedback) -> Rows:
     """Return the records of a feedback message, shape (count,), read-only.
 
     Raises:
-        WireError: the block's length is not `count` records, a sensor value is not finite, or a time is not
-            in 0 .. `MAX_T_NS`.
+        WireError: the block's length is not `count` records, a sensor value is not finite, or a time is
+            beyond `MAX_T_NS` on either side of zero.
     """
     if len(feedback.rows) != feedback.count * ROW.itemsize:
         raise WireError(
@@ -85,11 +85,11 @@ def unpack(feedback: Feedback) -> Rows:
     if not all(map(math.isfinite, map(sum, _MEASURED_PACKING.iter_unpack(feedback.rows)))):
         field = next(name for name in _MEASURED if not np.isfinite(rows[name]).all())
         raise WireError(Refusal.NOT_FINITE, f"{field} of serial {feedback.serial} is not finite")
-    # Read without sign, so that a time below zero is a large one.
     if not all(
-        t_ns <= MAX_T_NS and imu_ns <= MAX_T_NS for t_ns, imu_ns in _TIMES_PACKING.iter_unpack(feedback.rows)
+        -MAX_T_NS <= t_ns <= MAX_T_NS and -MAX_T_NS <= imu_ns <= MAX_T_NS
+        for t_ns, imu_ns in _TIMES_PACKING.iter_unpack(feedback.rows)
     ):
-        raise WireError(Refusal.MALFORMED, f"a time of serial {feedback.serial} is not in 0 .. {MAX_T_NS} ns")
+        raise WireError(Refusal.MALFORMED, f"a time of serial {feedback.serial} is beyond {MAX_T_NS} ns")
     return rows
 
 

@@ -169,10 +169,10 @@ def test_events_beyond_the_inbox_capacity_are_counted(bench: Bench) -> None:
     wire, posted = bench.wire, []
     messenger = Messenger(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
     messenger.start()
-    payload = encode(wire.status())
-    room = LANE_BYTES // (EVENT_BYTES + len(payload))
+    at, payload = key(wire.robot, "A", Leaf.STATUS), encode(wire.status())
+    room = LANE_BYTES // (EVENT_BYTES + len(at) + len(payload))
     for _ in range(room + 7):
-        bench.module.publish(key(wire.robot, "A", Leaf.STATUS), payload)
+        bench.module.publish(at, payload)
     bench.run(asyncio.sleep(0.01))
     assert messenger.dropped == 7
     assert len(posted) == 1  # one call is under way however many events wait
