@@ -129,7 +129,8 @@ class Firmware:
         self._stopped_ns = 0
         self._announced_until_ns = 0
         # Whether the motor is off while stopped, and which limits have acted since the last status.
-        self._stopped_off = self._hot = False
+        self._stopped_off = False
+        self._hot = False
         self._limited = 0
         self._expiries = 0
         self._seq = 0
