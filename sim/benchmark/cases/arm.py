@@ -224,9 +224,9 @@ PROFILES = ("x5", "x5-uncalibrated")
 KNOWN: dict[ImuKind, str] = {"calibrated": "IMU scale and axes", "uncalibrated": "nothing"}
 # Half as much again as the bound: 1.74 mm by the prior of the last IMU's place alone.
 TIP_MM = {"x5": 2.6, "x5-uncalibrated": 4.0}
-# Of motions that are shortened, one trial each: 1.94 times, what chance allows one tip in 99 of 100. With IMUs
-# as delivered four seeds of `arm7` have 3.5 to 4.4 mm, rms 3.97 with a scatter of 0.37: one in a thousand is
-# beyond 5.2, and two of the four are beyond what the many trials of long motions have to keep to.
+# Of motions that are shortened, one trial each: 1.94 times, what chance allows one tip in 99 of 100.
+# With IMUs as delivered four seeds of `arm7` have 3.5 to 4.4 mm, rms 3.97 with a scatter of 0.37: one in a
+# thousand is beyond 5.2, and two of the four exceed what the many trials of long motions have to keep to.
 SHORT_TIP_MM = {"x5": 3.4, "x5-uncalibrated": 5.2}
 LENGTHS, TIP = "link lengths of arms, x5", "tips of arms, x5"
 # Where the IMU's own axes are only known to a degree, no axis and no tip's orientation is known better.
