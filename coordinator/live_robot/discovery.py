@@ -29,11 +29,13 @@ M = TypeVar("M", bound=Message)
 class Search(NamedTuple):
     """How long to wait for modules: until none has come or left for `quiet_s`, at least `min_s`.
 
+    The first is waited for longer, `first_s`: that a robot is not there must not be said of a slow network.
     With `expect` the search ends as soon as so many are present.
     """
 
     quiet_s: float = 1.0
     min_s: float = 0.0
+    first_s: float = 4.0
     expect: int | None = None
 
 
@@ -70,7 +72,8 @@ def _present(transport: Transport, robot: str, search: Search) -> list[str]:
     alive: dict[str, bool] = {}
     start = changed = time.monotonic()
     while search.expect is None or sum(alive.values()) < search.expect:
-        end = min(max(start + search.min_s, changed + search.quiet_s), start + MAX_S)
+        quiet_s = search.quiet_s if alive else search.first_s
+        end = min(max(start + search.min_s, changed + quiet_s), start + MAX_S)
         try:
             event = events.get(timeout=max(0.0, end - time.monotonic()))
         except queue.Empty:

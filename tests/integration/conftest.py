@@ -188,7 +188,10 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
     made: list[Launcher] = []
 
     def make(
-        robot: str = "thesis_171_horizontal", network: str = "lan", lifetime_ms: int = 800, hebi: bool = False
+        robot: str = "thesis_171_horizontal",
+        network: str = "lan",
+        lifetime_ms: int = 1000,
+        hebi: bool = False,
     ) -> Launcher:
         config = LaunchConfig(
             robot_file=robot,
