@@ -18,13 +18,14 @@ from module_agent.hardware.bus_frames import (
 )
 from module_agent.hardware.hardware import HardwareLost, Readings, WiredModule
 from module_agent.model.compiled import compiled_with
+from module_agent.model.errors import UsageError
 
 # What kernels and Python keep of a bus: the tick to answer, whether it is answered, the last packet's length.
 TICK, ANSWERED, LENGTH = range(3)
 _RETRY_S = 0.02
 
 
-class BusRefused(HardwareLost):
+class BusRefused(UsageError):
     """The world does not serve these modules; the message is the world's reason."""
 
 
