@@ -5,6 +5,7 @@ from coordinator.runtime.command_line import lazy_app
 COMMANDS = {
     "run": ("run.run", "Identify a robot: topology, kinematic chain and inertia."),
     "replay": ("run.replay", "Compute a run's result again from its recording."),
+    "import": ("import_log.import_log", "Make a recording of a log of HEBI's programs."),
     "report": ("report.report", "Write the report of a run for people."),
     "export": ("export.export", "Write a run as a table, for ROS 2 or for Foxglove."),
     "list": ("list_modules.list_modules", "List the modules on the network."),
@@ -33,6 +34,7 @@ COMMANDS = {
 EXAMPLES = {
     "run": "x5-coordinator run --robot my_arm --expect 4 --out runs/my_arm",
     "replay": "x5-coordinator replay runs/my_arm/session.mcap --out runs/again",
+    "import": "x5-coordinator import arm.hebilog --type X5-4 --type X5-4 --out runs/logged",
     "report": "x5-coordinator report runs/my_arm --out my_arm.md",
     "export": "x5-coordinator export runs/my_arm --to ros2 --rate-hz 100 --out my_arm.mcap",
     "list": "x5-coordinator list --robot my_arm --expect 4",

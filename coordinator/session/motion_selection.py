@@ -25,7 +25,14 @@ from coordinator.excitation.single_joint import (
 from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.imu_prior import IMU_PRIORS
-from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, Pattern, WindowedSine
+from module_agent.wire.messages import (
+    ConstantMotion,
+    MotionRecord,
+    MultiSine,
+    OtherMotion,
+    Pattern,
+    WindowedSine,
+)
 
 # A session of designed motions: just under 10 s per joint, less the time to discover and check the modules,
 # to rest and to move all joints at once.
@@ -73,7 +80,7 @@ class MotionChoice:
         if wanted_mm is None or len(done) >= MAX_MOTIONS:
             return None
         task = self._task(serial, self._moved_limits(serial, done[0]))
-        patterns: list[Pattern] = [record.pattern for record in done]
+        patterns = _patterns(done)
         sigma = predicted_sigma_m(task, patterns)
         more = next_sine(task, patterns, 2.0 * self._plan.sine_centre_s)
         if sigma <= 1e-3 * wanted_mm or more is None:
@@ -83,7 +90,7 @@ class MotionChoice:
     def predicted_mm(self, serial: str, done: Sequence[MotionRecord]) -> float:
         """Return the predicted sigma of the radius after these motions [mm]."""
         task = self._task(serial, self._moved_limits(serial, done[0]))
-        return 1e3 * predicted_sigma_m(task, [record.pattern for record in done])
+        return 1e3 * predicted_sigma_m(task, _patterns(done))
 
     def simultaneous(self) -> dict[str, MultiSine]:
         """Return the motions of all joints at once."""
@@ -142,3 +149,7 @@ class MotionChoice:
         limits = joint_limits(self._kind(serial), rest_torque_nm, inertia_kg_m2)
         least = least_accel_rad_s2(len(self._serials()))
         return limits._replace(accel_rad_s2=max(limits.accel_rad_s2, least))
+
+
+def _patterns(done: Sequence[MotionRecord]) -> list[Pattern]:
+    return [record.pattern for record in done if not isinstance(record.pattern, OtherMotion)]

@@ -130,6 +130,13 @@ Pattern = Annotated[
     Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern | MultiSine, Field(discriminator="kind")
 ]
 
+
+class OtherMotion(Part):
+    """A motion that another program has commanded: it is known by its rows alone, and no module runs it."""
+
+    kind: Literal["other"] = "other"
+
+
 # The motions that all modules estimate from.
 EXPLORATION_KINDS = ("constant", "windowed_sine")
 
@@ -177,7 +184,7 @@ class MotionRecord(Part):
     """A motion as the module ran it; rows are feedback rows, `end_row` is one past the last."""
 
     motion_id: Counter
-    pattern: Pattern
+    pattern: Annotated[Pattern | OtherMotion, Field(discriminator="kind")]
     outcome: Literal["running", "done", "superseded", "stopped", "expired", "fault"]
     start_ns: Nanoseconds
     start_row: Counter

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from module_agent.hardware.hebi_log import read_tables
 from module_agent.model.errors import UsageError
 from module_agent.model.read_only import read_only
 from sim.geometry.pose import Array
@@ -84,20 +85,10 @@ def read_hebilog(path: Path, module: int, load: Callable[[str], Any]) -> RealLog
         load: `hebi.util.load_log`, or what stands in for it: iterates over feedback by `feedback_iterate`.
 
     Raises:
-        LogFileError: it is no log, has no such module, has fewer than two samples, or lacks a reading.
+        HebiLogError: it is no log, has no such module, or has fewer than two samples.
+        LogFileError: it lacks a reading.
     """
-    try:
-        log = load(str(path))
-    except OSError as error:
-        raise LogFileError(f"{path}: {error}") from error
-    if not 1 <= module <= log.number_of_modules:
-        raise LogFileError(f"{path}: it has {log.number_of_modules} modules, no module {module}")
-    names = ("hardware_transmit_time_us", *_HEBI.values())
-    rows = [[float(getattr(fed, name)[module - 1]) for name in names] for fed in log.feedback_iterate]
-    table = np.array(rows).reshape(-1, len(names))
-    table = table[np.diff(table[:, 0], prepend=-1.0) > 0.0]
-    if len(table) < 2:
-        raise LogFileError(f"{path}: {len(table)} samples of module {module}; at least 2 are needed")
+    (table,) = read_tables(path, list(_HEBI.values()), load, module)
     table[:, 0] = 1e-6 * (table[:, 0] - table[0, 0])
     for field, values in zip(_HEBI, table[:, 1:].T, strict=True):
         unset = np.flatnonzero(np.isnan(values))

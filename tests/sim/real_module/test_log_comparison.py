@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from typer.testing import CliRunner
 
 from module_agent.hardware.hebi_library import log_loader
+from module_agent.hardware.hebi_log import HebiLogError
 from module_agent.model.catalogue import CAPACITIES_J_K, RESISTANCES_K_W
 from sim.imperfections.noise_profile import noise_profile, switched
 from sim.main import app
@@ -308,13 +309,13 @@ def test_of_hebis_log_an_unset_reading_a_missing_module_and_a_file_that_is_none_
     broken = np.where(np.arange(len(log.t_s)) == 3, np.nan, log.voltage_v)
     with pytest.raises(LogFileError, match="sample 4: voltage: is not set"):
         read_hebilog(path, 2, lambda path: HebiLog(log, voltage=broken))
-    with pytest.raises(LogFileError, match="it has 2 modules, no module 3"):
+    with pytest.raises(HebiLogError, match="it has 2 modules, no module 3"):
         read_hebilog(path, 3, lambda path: HebiLog(log))
-    with pytest.raises(LogFileError, match="1 samples of module 1"):
+    with pytest.raises(HebiLogError, match="1 samples of module 1"):
         read_hebilog(path, 1, lambda path: HebiLog(log))
     pytest.importorskip("hebi")
     path.write_bytes(b"abc" * 100)
-    with pytest.raises(LogFileError, match="is not a valid log file"):
+    with pytest.raises(HebiLogError, match="is not a valid log file"):
         read_hebilog(path, 1, log_loader())
 
 
