@@ -4,9 +4,13 @@ Joints that have not moved yet count as locked: a module is mounted on the neare
 it, and modules without a link to another one yet are excluded. The chain is assembled from the modules'
 joint regressions (`kinematics.assembly`); the batch estimate follows at the end of the run. Every motion
 is filtered once and its thinned samples retained, so that a preview costs little more than its refinement.
+
+While all joints move at once, the part of their motion that is over is regressed on all of them instead
+(`kinematics.simultaneous_motion`): nothing is shown before the joints can be told apart and the topology is
+beyond doubt, and then all of the robot at once.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +18,16 @@ import numpy as np
 from coordinator.batch_estimation.estimator import refine_chain
 from coordinator.batch_estimation.link_compliance import compliance_jacobian, joined, loads_of
 from coordinator.batch_estimation.sensor_data import SensorData
+from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, joint_observation
+from coordinator.kinematics.simultaneous_motion import circle_observations, motion_observations
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, unbroken_windows
 from coordinator.synchronisation.round_trips import map_clocks
-from coordinator.topology.topology import MotionObservation, Topology, likely_topology
+from coordinator.topology.topology import MotionObservation, Topology, find_topology, likely_topology
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import IMU_PRIORS
@@ -70,6 +76,34 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     types = [recording.module_type(s) for s in topology.serials]
     fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
     return Preview(fit, tuple(moved), adjacent(fit.chain, moved))
+
+
+def preview_of_all(recording: Recording, event: JournalEvent, serials: Sequence[str]) -> Preview | None:
+    """Assemble the chain from a motion of all joints `serials` at once, as far as it is over.
+
+    Args:
+        recording: of everything up to now.
+        event: the motion of any of them; its `end_row` is one past the newest row.
+        serials: all modules that move.
+
+    Raises:
+        DataError: the joints cannot be told apart yet, the topology is in doubt, or rows are missing.
+    """
+    clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
+    response = respond(recording, clocks, serials, event)
+    topology = _linked(find_topology(motion_observations(serials, response)))
+    if not topology.serials:
+        return None
+    at = [serials.index(s) for s in topology.serials]
+    pairs = [
+        pair._replace(q_rad=pair.q_rad[at])
+        for pair in circle_observations(serials, response)
+        if {pair.joint, pair.observer} <= set(topology.serials)
+    ]
+    types = [recording.module_type(s) for s in topology.serials]
+    rest = recording.rest_observation(topology.serials)
+    fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
+    return Preview(fit, tuple(serials), adjacent(fit.chain, serials))
 
 
 def adjacent(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
@@ -171,24 +205,38 @@ class Previewer:
     def preview(self, explored: Collection[str]) -> Preview | None:
         """Return a preview from the explored joints; None as long as no module is linked to another.
 
-        It is not refined if samples are missing or the refinement fails.
+        If all joints have moved at once, and not all by themselves, it is one from that motion. It is not
+        refined if samples are missing or the refinement fails.
 
         Raises:
             DataError: see `preview`.
         """
-        assembled = preview(self._recording, explored)
+        serials = sorted({event.serial for event in self._recording.latest_motions("rest")})
+        whole = simultaneous_motion(self._recording, serials)
+        if whole is not None:
+            return self.preview_of_all(whole, serials)
+        return self._or_refined(preview(self._recording, explored), self._parts_of)
+
+    def preview_of_all(self, event: JournalEvent, serials: Sequence[str]) -> Preview | None:
+        """Return a preview from a motion of all joints at once, which may go on: see `preview_of_all`."""
+        assembled = preview_of_all(self._recording, event, serials)
+        return self._or_refined(assembled, lambda of_chain: [self._filtered(event, of_chain)])
+
+    def _or_refined(
+        self, assembled: Preview | None, parts: Callable[[Sequence[str]], list[SensorData]]
+    ) -> Preview | None:
+        """Return an assembled preview, refined by the samples of its modules where that is possible."""
         if assembled is None or len(assembled.adjacent) > self._max_refined:
             return assembled
         try:
-            return self._refined(assembled)
+            return self._refined(assembled, parts(assembled.fit.chain.serials))
         except (DataError, np.linalg.LinAlgError):
             return assembled
 
-    def _refined(self, assembled: Preview) -> Preview:
+    def _refined(self, assembled: Preview, parts: list[SensorData]) -> Preview:
         """Refine the rigid chain, then again with compliant links."""
         chain, prior = assembled.fit.chain, IMU_PRIORS[self._recording.imu]
         kinds = [self._recording.module_type(s) for s in chain.serials]
-        parts = self._parts_of(chain.serials)
         every = max(FITTED_EVERY, -(-sum(part.q_rad.size for part in parts) // MAX_IMU_SAMPLES))
         data = thinned(parts, every)
         rigid = refine_chain(chain, data, prior)
@@ -213,11 +261,13 @@ class Previewer:
         assert event.motion is not None
         key = (event.serial, event.motion.motion_id, serials)
         if key not in self._parts:
-            clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
-            windows = unbroken_windows(self._recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
-            parts = [filtered(one, REFINEMENT_CUTOFF_HZ) for one in windows]
-            self._parts[key] = thinned(parts, RETAINED_EVERY)
+            self._parts[key] = self._filtered(event, serials)
         return self._parts[key]
+
+    def _filtered(self, event: JournalEvent, serials: Sequence[str]) -> SensorData:
+        clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
+        windows = unbroken_windows(self._recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
+        return thinned([filtered(one, REFINEMENT_CUTOFF_HZ) for one in windows], RETAINED_EVERY)
 
 
 def _columns(part: SensorData, at: Sequence[int]) -> SensorData:

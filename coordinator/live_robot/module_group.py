@@ -404,6 +404,14 @@ class ModuleGroup:
             records[serial] = motion
         return records
 
+    def running(self, serial: str) -> MotionRecord | None:
+        """Return the motion that a module says it is running, up to its newest row; None if there is none."""
+        status, end_row = self.module(serial).status, self.module(serial).rows.end_row
+        motion = status.motion if status is not None else None
+        if motion is None or motion.outcome != "running" or end_row <= motion.start_row:
+            return None
+        return motion.model_copy(update={"end_row": end_row})
+
     def _expired(self, moved: Container[str]) -> str | None:
         """Return a held module without a motion that has expired meanwhile."""
         for serial in self._tokens:

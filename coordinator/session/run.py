@@ -5,6 +5,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -74,6 +75,11 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError, UsageError
 from module_agent.transport.transport import Transport
 from module_agent.wire.messages import Message, Pattern
+
+# While all joints move at once there is a preview so often, or as seldom as keeps previews to a share of the
+# time: as much of one processor is left to the network and the recording, whatever the robot's size.
+PREVIEW_EVERY_S = 2.0
+PREVIEW_SHARE = 0.25
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
@@ -194,6 +200,7 @@ class Run:
         self._feed = ViewerFeed(viewer, self.recording, overlay)
         self._previewer = Previewer(self.recording, config.refined_previews)
         self._preview_task: asyncio.Task[None] | None = None
+        self._next_preview_ns = 0
         self._chain: Chain | None = None
         self._explored: Kinematics | None = None
         self._identified: Identified | None = None
@@ -264,19 +271,36 @@ class Run:
         self._feed.estimates(joint, self._clock())
         # Of a resumed run also the joints explored before.
         explored = sorted({moved for moved, _ in self.recording.estimates})
+        self._begin_preview(lambda: self._previewer.preview(explored))
+
+    async def moving(self, serials: Sequence[str]) -> None:
+        """Show previews of a robot that moves all its joints at once, until cancelled."""
+        while True:
+            await asyncio.sleep(PREVIEW_EVERY_S)
+            motion = self._group.running(serials[0])
+            if motion is not None and self._clock() >= self._next_preview_ns:
+                event = JournalEvent(
+                    t_ns=self._clock(), what="motion", serial=serials[0], purpose="whole", motion=motion
+                )
+                self._begin_preview(partial(self._previewer.preview_of_all, event, serials))
+
+    def _begin_preview(self, work: Callable[[], Preview | None]) -> None:
         if self._config.inline:
-            self._show_preview(self._preview(explored))
+            self._show_preview(self._preview(work))
         elif self._preview_task is None or self._preview_task.done():
-            # One preview at a time: while one is being computed, a joint does not start another.
-            self._preview_task = asyncio.create_task(self._show_preview_later(explored))
+            # One preview at a time: while one is being computed, no other is begun.
+            self._preview_task = asyncio.create_task(self._show_preview_later(work))
 
-    async def _show_preview_later(self, explored: list[str]) -> None:
-        self._show_preview(await self._compute(lambda: self._preview(explored)))
+    async def _show_preview_later(self, work: Callable[[], Preview | None]) -> None:
+        began_ns = self._clock()
+        preview = await self._compute(lambda: self._preview(work))
+        self._next_preview_ns = began_ns + int((self._clock() - began_ns) / PREVIEW_SHARE)
+        self._show_preview(preview)
 
-    def _preview(self, explored: list[str]) -> Preview | None:
+    def _preview(self, work: Callable[[], Preview | None]) -> Preview | None:
         """Return a preview of the robot, None if there is none; a run does not fail for lack of one."""
         try:
-            return self._previewer.preview(explored)
+            return work()
         except (DataError, KeyError) as error:
             logger.info("no preview of the robot: %s", error)
         except Exception:

@@ -46,6 +46,10 @@ class Reporter(Screen, Protocol):
         """Report that all estimates of the motions of a joint have arrived."""
         ...
 
+    async def moving(self, serials: Sequence[str]) -> None:
+        """Report on joints that move all at once, until it is cancelled: their motion is over."""
+        ...
+
     async def doubts(self) -> Sequence[NextMotion]:
         """Return the motions to repeat to settle doubts about the topology, after all joints are explored."""
         ...
@@ -362,7 +366,16 @@ class Session:
 
     async def _explore_all(self) -> None:
         """Move all joints about home at the same time, each at its own frequencies (thesis 7.2)."""
-        records = await self.group.run(self._choice.simultaneous())
+        patterns = self._choice.simultaneous()
+        # Of joints that were moved one by one as well, the estimates are there already.
+        shown = patterns if self._plan.mode == "simultaneous" else ()
+        showing = [asyncio.create_task(self._reporter.moving(tuple(shown)))] if shown else []
+        try:
+            records = await self.group.run(patterns)
+        finally:
+            for task in showing:
+                task.cancel()
+            await asyncio.gather(*showing, return_exceptions=True)
         for serial, record in records.items():
             self._note_motion("explore", serial, record, "whole")
 

@@ -3,7 +3,7 @@
 The recording equals a run's `session.mcap`; it is for experiments that need many sessions and no folder.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.plan import Plan
@@ -84,6 +84,9 @@ class _MemoryRecorder(SilentScreen):
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
 
     def estimates(self, joint: str) -> None:
+        """Draw nothing."""
+
+    async def moving(self, serials: Sequence[str]) -> None:
         """Draw nothing."""
 
     async def doubts(self) -> tuple[NextMotion, ...]:

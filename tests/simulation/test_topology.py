@@ -69,6 +69,9 @@ class Watcher:
     def estimates(self, joint: str) -> None:
         """Nothing is drawn."""
 
+    async def moving(self, serials: Sequence[str]) -> None:
+        """Nothing is drawn."""
+
     async def doubts(self) -> Sequence[NextMotion]:
         return doubtful_motions(self.recording)
 

@@ -3,17 +3,20 @@
 import asyncio
 import logging
 import threading
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from coordinator.identification.preview import Previewer
 from coordinator.live_robot.messenger import Sender
-from coordinator.session.run import Run, RunConfig
+from coordinator.recording.journal import JournalEvent
+from coordinator.session.run import PREVIEW_EVERY_S, PREVIEW_SHARE, Run, RunConfig
 from module_agent.transport.transport import Transport
+from module_agent.wire.messages import MotionRecord, Rest
 
 
 class Slow:
@@ -31,11 +34,17 @@ class Slow:
         return SimpleNamespace(explored=tuple(explored))
 
 
-def run_of(tmp_path: Path, previewer: Any, shown: list[Any], inline: bool = False) -> Run:
+def run_of(
+    tmp_path: Path,
+    previewer: Any,
+    shown: list[Any],
+    inline: bool = False,
+    clock: Callable[[], int] = lambda: 0,
+) -> Run:
     transport: Transport = SimpleNamespace()  # type: ignore[assignment]
     screen = SimpleNamespace(step=lambda *_: None, note=lambda *_: None)
     config = RunConfig(robot="arm", out=tmp_path / "run", sender=Sender("me"), inline=inline)
-    run = Run(config, transport, lambda: 0, lambda work: None, screen)  # type: ignore[arg-type]
+    run = Run(config, transport, clock, lambda work: None, screen)  # type: ignore[arg-type]
     run._previewer = previewer
     run._feed = SimpleNamespace(  # type: ignore[assignment]
         estimates=lambda *_: None, preview=lambda t_ns, preview: shown.append(preview.explored)
@@ -100,3 +109,45 @@ def test_without_estimates_there_is_no_preview(tmp_path: Path) -> None:
     run._previewer = Previewer(run.recording)
     run.estimates("A")
     assert shown == []
+
+
+def test_previews_of_a_moving_robot_take_no_more_than_their_share_of_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    took_ns, begun_ns, now_ns, shown = 3_000_000_000, [], [0], []
+
+    class Moving:
+        """Every preview takes 3 s of the session's time."""
+
+        def preview_of_all(self, event: JournalEvent, serials: Sequence[str]) -> Any:
+            assert event.motion is motion
+            begun_ns.append(now_ns[0])
+            now_ns[0] += took_ns
+            return SimpleNamespace(explored=tuple(serials))
+
+    async def sleep(seconds: float) -> None:
+        now_ns[0] += int(1e9 * seconds)
+        if run._preview_task is not None:
+            await run._preview_task
+        if now_ns[0] > 60_000_000_000:
+            raise asyncio.CancelledError
+
+    motion = MotionRecord(
+        motion_id=1,
+        pattern=Rest(duration_s=1.0),
+        outcome="running",
+        start_ns=0,
+        start_row=0,
+        end_row=9,
+        origin_rad=0.0,
+    )
+    run = run_of(tmp_path, Moving(), shown, clock=lambda: now_ns[0])
+    run._group = SimpleNamespace(running=lambda serial: motion)  # type: ignore[assignment]
+    monkeypatch.setattr("coordinator.session.run.asyncio.sleep", sleep)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(run.moving(["A", "B"]))
+    # Of every 12 s at most 3; the next one begins with the first look after that, and the looks are here 2 s
+    # and the 3 s apart that a preview takes of this clock.
+    assert len(shown) >= 4
+    assert min(np.diff(begun_ns)) >= took_ns / PREVIEW_SHARE
+    assert max(np.diff(begun_ns)) <= took_ns / PREVIEW_SHARE + 1e9 * PREVIEW_EVERY_S + took_ns
