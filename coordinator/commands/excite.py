@@ -7,9 +7,9 @@ import numpy as np
 import typer
 
 from coordinator.commands.options import Quiet
+from coordinator.description.shape_clearance import ClearanceCheck, clearance_check
 from coordinator.description.urdf_reader import UrdfRobot, read_urdf
 from coordinator.description.urdf_shapes import read_shapes
-from coordinator.excitation.shape_clearance import ClearanceCheck, clearance_check
 from coordinator.excitation.urdf_motion import (
     ROUNDS,
     Design,

@@ -16,6 +16,9 @@ from coordinator.kinematics.frames import housing_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
 
+# Of a link, whose shape is not identified: the kit's tubes are 32 mm across.
+LINK_RADIUS_M = 0.016
+
 
 class Module(NamedTuple):
     """Geometry of one module of a chain.

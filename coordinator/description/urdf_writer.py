@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from coordinator.description.module_geometry import Module, placed_modules
+from coordinator.description.module_geometry import LINK_RADIUS_M, Module, placed_modules
 from coordinator.description.module_geometry import links as links_between
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import (
@@ -40,8 +40,6 @@ from module_agent.model.regressor import PER_BODY, check_phi
 
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ALL_DETERMINED: Mapping[str, Sequence[str]] = MappingProxyType({})
-# Of a link whose shape is not identified: that of the kit's tubes.
-LINK_RADIUS_M = 0.016
 # Shorter links are faces that lie on each other.
 _MIN_LINK_M = 1e-3
 
@@ -119,6 +117,11 @@ def robot_element(
             _make_of_joint(joint, module_types[i])
     frames = [("imu", k, chain.carrier(k), chain.imu_home[k]) for k in range(joints)]
     if module_types is not None:
+        comment(
+            robot,
+            "Shapes are approximations: boxes around housings by the catalogue, and for links straight tubes "
+            "of the kit between the identified places of modules.",
+        )
         _add_shapes(links, homes, chain, placed_modules(chain, module_types))
         frames += _module_frames(chain, module_types)
     for kind, k, on, home in frames:

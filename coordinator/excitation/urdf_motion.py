@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import null_space
 
+from coordinator.description.shape_clearance import ClearanceCheck
 from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.drive_model import USUAL_TERMS, drive_columns, drive_regressor, drive_signals
 from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.segment import SampledMotion
-from coordinator.excitation.shape_clearance import ClearanceCheck
 from coordinator.parameter_fit.base_parameters import inertial_columns
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE, spectrum
 from module_agent.model.chain import Array

@@ -10,11 +10,12 @@ from coordinator.recording.session_file import SessionFileError, read_session
 from module_agent.model.errors import UsageError
 from module_agent.wire.refusal import WireError
 
-SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION, CALIBRATION, MEASURED, REPORT = (
+SESSION, VIEW, RESULT, URDF, SRDF, HRDF, HELD_OUT, INFORMATION, CALIBRATION, MEASURED, REPORT = (
     "session.mcap",
     "session.rrd",
     "result.json",
     "robot.urdf",
+    "robot.srdf",
     "robot.hrdf",
     "held_out.npz",
     "information.npz",

@@ -20,6 +20,7 @@ from coordinator.baseline.baseline_robot import (
 )
 from coordinator.baseline.difference import difference, joints_to_explore
 from coordinator.description.hrdf_writer import write_hrdf
+from coordinator.description.srdf_writer import write_srdf
 from coordinator.description.urdf_writer import write_urdf
 from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.plan import Plan
@@ -55,6 +56,7 @@ from coordinator.recording.run_folder import (
     MEASURED,
     RESULT,
     SESSION,
+    SRDF,
     URDF,
     VIEW,
     open_run_folder,
@@ -518,6 +520,7 @@ def write_outputs(out: Path, identified: Identified) -> None:
     )
     undetermined = dynamics.undetermined if dynamics is not None else {}
     write_urdf(out / URDF, chain, phi, name, types, undetermined, identified.result.unknown_links)
+    write_srdf(out / SRDF, out / URDF)
     write_hrdf(out / HRDF, chain, types, phi, name, undetermined)
     if identified.held_out is not None:
         write_held_out(out / HELD_OUT, identified.held_out)

@@ -12,6 +12,7 @@ FILES = (
     "session.rrd",
     "result.json",
     "robot.urdf",
+    "robot.srdf",
     "robot.hrdf",
     "held_out.npz",
     "information.npz",

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from coordinator.description.module_geometry import Link, Module, from_z, links
+from coordinator.description.module_geometry import LINK_RADIUS_M, Link, Module, from_z, links
 from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.robot_geometry import modules, upright
 from coordinator.viewer.scene.time_series import IntArray, time_column
@@ -15,7 +15,6 @@ from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.perturbation import skew
 
-LINK_RADIUS_M = 0.009
 OUTPUT_RADIUS_M = 0.024
 OUTPUT_THICKNESS_M = 0.008
 AXIS_LENGTH_M = 0.09
@@ -230,11 +229,12 @@ class _Painter(NamedTuple):
             fill_mode="transparentfillmajorwireframe",
         )
 
-    def _links(self, joined: Sequence[Link]) -> rr.Capsules3D:
-        return rr.Capsules3D(
+    def _links(self, joined: Sequence[Link]) -> rr.Cylinders3D:
+        """Draw links as the tubes that the URDF has: what they truly look like is not identified."""
+        return rr.Cylinders3D(
             lengths=[link.length_m for link in joined],
             radii=[LINK_RADIUS_M] * len(joined),
-            translations=[link.start for link in joined],
+            centers=[0.5 * (link.start + link.end) for link in joined],
             quaternions=[_quaternion(from_z((link.end - link.start) / link.length_m)) for link in joined],
             colors=[self.style.link] * len(joined),
             fill_mode=self.style.fill,

@@ -37,7 +37,7 @@ class ClearanceCheck(NamedTuple):
     def clearance_m(self, q_rad: Array) -> Array:
         """Return how near the pairs come at positions (m, n): lower bounds (m, p) up to some 0.2 m."""
         blocks = range(0, len(q_rad), _BLOCK)
-        parts = [_separations(self.chain, self.shapes, self.pairs, q_rad[k : k + _BLOCK]) for k in blocks]
+        parts = [separations(self.chain, self.shapes, self.pairs, q_rad[k : k + _BLOCK]) for k in blocks]
         return np.concatenate(parts)
 
     def is_clear(self, q_rad: Array) -> bool:
@@ -58,14 +58,14 @@ def clearance_check(chain: Chain, shapes: Shapes, home_rad: Array, clearance_m: 
     standing = np.array([link == "floor" for link in shapes.link], dtype=bool)
     considered = (body != below) & (~joined | standing[one] | standing[other])
     pairs = np.array([one, other])[:, considered]
-    at_home = _separations(chain, shapes, pairs, home_rad[None])[0]
+    at_home = separations(chain, shapes, pairs, home_rad[None])[0]
     touching = [(shapes.link[a], shapes.link[b]) for a, b in pairs[:, at_home <= 0.0].T]
     pairs, at_home = pairs[:, at_home > 0.0], at_home[at_home > 0.0]
     allowed = np.where(at_home < clearance_m, 0.5 * at_home, clearance_m)
     return ClearanceCheck(chain, shapes, pairs, allowed, tuple(dict.fromkeys(touching)))
 
 
-def _separations(chain: Chain, shapes: Shapes, pairs: NDArray[np.int64], q_rad: Array) -> Array:
+def separations(chain: Chain, shapes: Shapes, pairs: NDArray[np.int64], q_rad: Array) -> Array:
     """Return lower bounds (m, p) of the distances of pairs of shapes (2, p)."""
     displaced = np.concatenate(
         [body_displacements(chain, q_rad), np.broadcast_to(np.eye(4), (len(q_rad), 1, 4, 4))], axis=1

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from coordinator.description.shape_clearance import projected_gap
 from coordinator.description.urdf_shapes import Shapes
-from coordinator.excitation.shape_clearance import projected_gap
 
 # Box, cylinder, sphere, capsule: half lengths, radii of disc and ball, and the same to coal.
 KINDS = (
