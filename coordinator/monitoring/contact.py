@@ -112,6 +112,9 @@ class ContactDetector:
 
     def advance(self, t_ns: NDArray[np.int64], fast_nm: Array) -> list[Contact]:
         """Take the next samples, (m,) and (m, n); return contacts that begin or end in them."""
+        if self.now is None and not (np.abs(fast_nm) > self.level_nm).any():
+            self._above[:] = 0
+            return []
         findings = []
         for at_ns, sample in zip(t_ns, fast_nm, strict=True):
             at = int(at_ns)

@@ -5,7 +5,8 @@ that have changed are a payload's if one body explains them.
 """
 
 from collections.abc import Sequence
-from functools import reduce
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from coordinator.monitoring.likelihood_ratio import Change, WhitenedRows, joined
 from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
     UNIT_PAYLOAD_KG,
+    ImuModel,
     displacement,
     drive_window,
     imu_rows,
@@ -47,8 +49,9 @@ ONE_IN = 1e4
 MIN_SIGMAS = 5.0
 
 
-class SegmentInformation(NamedTuple):
-    """What one stretch says: evidence of torques, IMUs (own parameters first) and every drive.
+@dataclass(frozen=True, eq=False)
+class SegmentInformation:
+    """What one stretch says: evidence of torques, of every drive, and of IMUs when it is asked for.
 
     moved: whether a joint moved in it.
     """
@@ -57,8 +60,14 @@ class SegmentInformation(NamedTuple):
     end_ns: int
     moved: bool
     information: tuple[JointInformation, ...]
-    imu: WhitenedRows
     drives: tuple[WhitenedRows | None, ...]
+    imu_model: ImuModel
+    segment: DataSegment
+
+    @cached_property
+    def imu(self) -> WhitenedRows:
+        """The evidence of the IMUs, own parameters first; a robot at rest is not asked for it."""
+        return imu_rows(self.imu_model, self.segment)
 
 
 class LoadShift(NamedTuple):
@@ -89,8 +98,9 @@ def segment_information(reference: Reference, segment: DataSegment) -> SegmentIn
         int(segment.t_ns[-1]),
         bool((np.abs(segment.qd_rad_s) > MOVING_RAD_S).any()),
         information_of(reference.chain, segment),
-        imu_rows(reference.imu_model, segment),
         drives,
+        reference.imu_model,
+        segment,
     )
 
 
@@ -109,7 +119,7 @@ def diagnose(
 
 
 def _merged(window: Sequence[SegmentInformation]) -> tuple[JointInformation, ...]:
-    return reduce(merge, [segment.information for segment in window])
+    return merge(*(segment.information for segment in window))
 
 
 def _drives(

@@ -107,7 +107,8 @@ class Monitor:
                 found, dropped = self._look(aligned.block)
                 findings += found
                 withdrawn += dropped
-            elif not aligned.gaps:
+            if not aligned.gaps:
+                # A block ends with the newest rows.
                 break
         return MonitorUpdate(tuple(findings), tuple(withdrawn), tuple(notes))
 

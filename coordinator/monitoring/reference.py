@@ -6,7 +6,6 @@ is what they find in a robot that has not changed; by that their noise is inflat
 """
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -167,10 +166,10 @@ def _torque(
 ) -> tuple[Array, tuple[JointInformation, ...], BaselineTest]:
     sigma, counted = noise_level([torque_residual(chain, phi, one) for one in segments])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
-    windows = [reduce(merge, [information_of(chain, one) for one in window]) for window in _windows(segments)]
+    windows = [merge(*(information_of(chain, one) for one in window)) for window in _windows(segments)]
     evidence = [torque_rows(window, phi, independent) for window in windows]
     test = _calibrated(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
-    return independent, reduce(merge, windows), test
+    return independent, merge(*windows), test
 
 
 def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuModel, BaselineTest]:

@@ -173,11 +173,11 @@ def _cubic(t_ns: Times, values: Array, at_ns: Times) -> Array:
     """Interpolate (k, c) values at times (m,) by the cubic through the four samples around each."""
     first = np.clip(np.searchsorted(t_ns, at_ns, side="right") - 2, 0, max(len(t_ns) - 4, 0))
     index = first[:, None] + np.arange(min(4, len(t_ns)))
-    known = 1e-9 * (t_ns[index] - at_ns[:, None])
+    known = tuple(1e-9 * (t_ns[index] - at_ns[:, None]).T)
     found = np.zeros((len(at_ns), values.shape[1]))
-    for k, own in enumerate(known.T):
+    for k, own in enumerate(known):
         weight = np.ones(len(at_ns))
-        for other in np.delete(known, k, axis=1).T:
+        for other in (*known[:k], *known[k + 1 :]):
             weight *= other / (other - own)
         found += weight[:, None] * values[index[:, k]]
     return found

@@ -119,29 +119,31 @@ def _own_rows(chain: Chain, joint: int, signals: Sequence[Array]) -> Array:
     return rows
 
 
-def merge(one: Sequence[JointInformation], other: Sequence[JointInformation]) -> tuple[JointInformation, ...]:
-    """Return the information of both, joint by joint: as if all their samples had been taken together.
+def merge(*pieces: Sequence[JointInformation]) -> tuple[JointInformation, ...]:
+    """Return the information of all pieces, joint by joint: as if all samples had been taken together.
 
     Raises:
-        ValueError: the two are of robots with different numbers of joints, or of different columns.
+        ValueError: no pieces, or pieces of robots with different numbers of joints, or of different columns.
     """
-    if len(one) != len(other):
-        raise ValueError(f"information of {len(one)} joints cannot be merged with that of {len(other)}")
-    return tuple(merge_joint(a, b) for a, b in zip(one, other, strict=True))
+    joints = {len(piece) for piece in pieces}
+    if len(joints) != 1:
+        raise ValueError(f"pieces of information of {sorted(joints)} joints cannot be merged")
+    return tuple(merge_joint(*of_joint) for of_joint in zip(*pieces, strict=True))
 
 
-def merge_joint(one: JointInformation, other: JointInformation) -> JointInformation:
-    """Return the information of both, of one joint.
+def merge_joint(*pieces: JointInformation) -> JointInformation:
+    """Return the information of all pieces, of one joint.
 
     Raises:
-        ValueError: they have different columns.
+        ValueError: no pieces, or pieces in different columns.
     """
-    if one.r.shape[1] != other.r.shape[1]:
-        raise ValueError(
-            f"information in {one.r.shape[1]} columns cannot be merged with that in {other.r.shape[1]}"
-        )
-    rows, target = np.vstack([one.r, other.r]), np.concatenate([one.z, other.z])
-    return _triangular(rows, target, one.rest + other.rest, one.samples + other.samples)
+    columns = {piece.r.shape[1] for piece in pieces}
+    if len(columns) != 1:
+        raise ValueError(f"pieces of information in {sorted(columns)} columns cannot be merged")
+    rows, target = np.vstack([piece.r for piece in pieces]), np.concatenate([piece.z for piece in pieces])
+    return _triangular(
+        rows, target, sum(piece.rest for piece in pieces), sum(piece.samples for piece in pieces)
+    )
 
 
 def _triangular(y: Array, tau: NDArray[np.float64], rest: float, samples: int) -> JointInformation:

@@ -6,11 +6,13 @@ import sys
 import numpy as np
 import pytest
 from numpy.random import Generator
+from scipy.interpolate import CubicSpline
 from scipy.signal import butter, lfilter, sosfiltfilt
 
 from module_agent.model.errors import DataError
 from module_agent.signals.filtering import (
     FILTER_ORDER,
+    SHORT,
     differentiate,
     filtered_motion,
     leaky_sum,
@@ -61,6 +63,19 @@ def test_the_derivative_of_a_sine_is_its_cosine() -> None:
     expected = rate * np.column_stack([np.cos(rate * t), -np.sin(rate * t)])[20:-20]
     # A tenth of the sampling rate: the spline's derivative is short by (w h)^4 / 180 = 0.09 %.
     assert np.abs(found - expected).max() < 1.5e-3 * rate
+
+
+@pytest.mark.parametrize("samples", [2, 3, SHORT, SHORT + 1])
+def test_the_slopes_of_signals_of_any_length_are_those_of_their_spline(rng: Generator, samples: int) -> None:
+    signal = rng.normal(size=(samples, 2, 3))
+    t = np.arange(samples) / RATE_HZ
+    # 256 products of numbers of up to 250 / s.
+    assert np.abs(differentiate(signal, RATE_HZ) - CubicSpline(t, signal)(t, 1)).max() < 1e-9
+
+
+def test_what_is_no_number_has_no_slope() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        differentiate(np.array([0.0, np.nan, 1.0]), RATE_HZ)
 
 
 def test_clocks_that_drift_apart_come_onto_one_time_base(rng: Generator) -> None:
