@@ -1,6 +1,7 @@
 """What a known robot weighs, read from the folder of a run."""
 
 import json
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.identify import identify
 from coordinator.identification.result import write_result
 from coordinator.recording.run_folder import RESULT
+from coordinator.recording.versions import Versions
 from coordinator.torque_control.gravity_model import gravity_model
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.network_emulation.profile import PROFILES
@@ -62,6 +64,22 @@ def test_the_weight_of_the_upright_arm_is_what_the_simulated_one_weighs(tmp_path
     assert abs(true[0]) > 0.5
     # The motions were short, and the torque sensor's scale is only as known as it is.
     np.testing.assert_allclose(found[0], true[0], rtol=0.1)
+
+
+def test_the_next_start_takes_the_version_of_the_model_that_holds_now(
+    known_folder: Callable[..., Path],
+) -> None:
+    folder = known_folder("thesis_171_horizontal")
+    first, versions = gravity_model(folder), Versions(folder)
+    document = json.loads((folder / RESULT).read_text())
+    document["dynamics"]["phi"] = (2.0 * first.phi).tolist()
+    versions.next_run().mkdir(parents=True)
+    (versions.run_folder(2) / RESULT).write_text(json.dumps(document))
+    assert np.array_equal(gravity_model(folder).phi, first.phi)
+    versions.replace(2, "2026-01-05T10:00:00+00:00", ["a payload stays"], ["twice as heavy"])
+    assert np.array_equal(gravity_model(folder).phi, 2.0 * first.phi)
+    versions.choose(1, "2026-01-05T11:00:00+00:00")
+    assert np.array_equal(gravity_model(folder).phi, first.phi)
 
 
 def test_a_run_without_dynamics_does_not_tell_the_weight(tmp_path: Path) -> None:
