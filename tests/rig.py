@@ -68,6 +68,7 @@ class Rig(VirtualRobot):
             load_robot(robot), impaired, seed, noise, hebi_rate_hz=hebi_rate_hz, physics=physics
         )
         super().__init__(settings, loop, shared, **firmware)
+        self.notes: list[str] = []
         self.start()
 
     def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
@@ -114,9 +115,16 @@ class Rig(VirtualRobot):
         messenger.start()
         return messenger, recording, ModuleGroup(messenger, recording, clock, Sender(sender, SECRET))
 
-    def session(self, out: Path, plan: Plan, resume: bool = False, sender: str = "coordinator") -> Result:
+    def session(
+        self,
+        out: Path,
+        plan: Plan,
+        resume: bool = False,
+        sender: str = "coordinator",
+        expects: bool = True,
+    ) -> Result:
         """Run a whole identification and write its folder, truth included."""
-        result = self.run(self.begin(out, plan, resume, sender).run())
+        result = self.run(self.begin(out, plan, resume, sender, expects=expects).run())
         write_truth(out / "truth.json", self.world.robot)
         self.truth.save(out / "truth.npz")
         return result
@@ -128,15 +136,16 @@ class Rig(VirtualRobot):
         resume: bool = False,
         sender: str = "coordinator",
         expect: int | None = None,
+        expects: bool = True,
     ) -> Run:
-        """Make a coordinator that is to run a whole identification."""
+        """Make a coordinator that is to run a whole identification; without `expects`, of what there is."""
         notes = Notes()
         config = RunConfig(
             self.robot.name,
             out,
             Sender(sender, SECRET),
             plan,
-            expect or len(self.serials),
+            (expect or len(self.serials)) if expects else None,
             resume=resume,
             inline=True,
         )

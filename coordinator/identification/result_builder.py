@@ -35,6 +35,7 @@ from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
 from coordinator.parameter_fit.report_parts import base_parameter_parts, finite, imu_place_parts
+from coordinator.recording.journal import exclusion_notes
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.feedback_delays import feedback_delays
 from coordinator.topology.topology import Topology
@@ -58,6 +59,7 @@ def build_result(
     began = [e for e in recording.journal if e.what == "session"]
     finished = [e for e in recording.journal if e.what == "finished"]
     notes = [
+        *exclusion_notes(recording.journal),
         bodies.note if bodies is not None else "",
         inertia.gathered.note if inertia is not None and inertia.gathered is not None else "",
     ]
@@ -82,7 +84,7 @@ def build_result(
             DhPart.of(path, rows=[DhRowPart.of(row) for row in path.rows]) for path in dh_paths(fit.chain)
         ],
         dynamics=_dynamics(inertia, held_out, bodies) if inertia is not None and bodies is not None else None,
-        notes=[*kinematics.notes, *filter(None, notes), *recording.remarks],
+        notes=list(dict.fromkeys([*kinematics.notes, *filter(None, notes), *recording.remarks])),
         imu_places=imu_place_parts(kinematics.refinement.calibration),
         sensors=[SensorPart.of(one, summary=one.summary) for one in kinematics.findings],
         excluded=list(kinematics.excluded),

@@ -11,7 +11,7 @@ from coordinator.identification.topology_observations import (
     slow_motions,
 )
 from coordinator.kinematics.simultaneous_motion import motion_observations
-from coordinator.recording.journal import excluded_modules
+from coordinator.recording.journal import exclusion_notes
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.next_motion import NextMotion, next_motions
@@ -52,7 +52,7 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
         )
     observations, unmoved = _usable(observed)
     topology = find_topology(observations, unmoved)
-    excluded = [f"{s} took no part: {why}" for s, why in excluded_modules(recording.journal).items()]
+    excluded = exclusion_notes(recording.journal)
     return TopologyFound(topology, observations, (*excluded, *_notes(observed, topology)))
 
 

@@ -1,5 +1,7 @@
 """Errors of the connection to a robot, before and during a session; the messages name the module."""
 
+from collections.abc import Sequence
+
 from module_agent.model.errors import LostError, RobotError
 
 
@@ -13,6 +15,15 @@ class ModuleLost(LostError):
     def __init__(self, serial: str, why: str):
         super().__init__(f"module {serial} is lost: {why}")
         self.serial = serial
+
+
+class ModulesJoined(RobotError):
+    """Modules came in the middle of a session that began without them; the message names them."""
+
+    def __init__(self, serials: Sequence[str], present: Sequence[str]):
+        names = f"module {serials[0]}" if len(serials) == 1 else f"modules {', '.join(serials)}"
+        super().__init__(f"{names} came in the middle of a session of {', '.join(present)}")
+        self.serials = tuple(serials)
 
 
 class RobotStopped(RobotError):

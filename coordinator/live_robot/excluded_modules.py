@@ -28,19 +28,19 @@ class ExcludedModules:
         return tuple(s for s in self._group.serials if s not in self.why)
 
     async def meet(self, serials: Sequence[str]) -> None:
-        """Register all modules; exclude those that are present but do not answer or send no feedback."""
-        met = []
+        """Register more modules; exclude those that are present but do not answer or send no feedback."""
+        met = list(self._group.serials)
         for serial in serials:
             try:
                 await self._group.meet([serial])
                 met.append(serial)
             except NoAnswer as error:
                 self._exclude(serial, str(error))
-        self._group.serials = tuple(met)
+        self._group.serials = tuple(sorted(met))
         await self._group.wait(lambda: not self._group.without_feedback(), FEEDBACK_WAIT_S)
         for serial in self._group.without_feedback():
             self._exclude(serial, f"module {serial} answers, but sends no feedback")
-        self._group.serials = tuple(s for s in met if s not in self.why)
+        self._group.serials = tuple(s for s in sorted(met) if s not in self.why)
 
     def without(self, error: Refused | MotionInterrupted) -> bool:
         """Exclude the module of an error if repeating cannot help; return whether it was excluded.

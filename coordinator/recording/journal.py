@@ -15,14 +15,18 @@ from module_agent.wire.refusal import Refusal, WireError
 # Prefix of the steps of notes on excluded modules.
 STEP = "left_out/"
 
+What = Literal[
+    "session", "begin", "done", "motion", "note", "anew", "explored", "settled", "failed", "finished"
+]
 Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynamic", "held_out", "other"]
 
 
 class JournalEvent(BaseModel):
     """One line of the journal; `what` says which of the other fields are set.
 
-    `explored`: topology and chain are identified from what was recorded before this event. `settled`: the
-    clocks are mapped by the round trips before this event; later requests to the modules do not change them.
+    `anew`: modules have joined the robot, and motions before this event do not describe it. `explored`:
+    topology and chain are identified from what was recorded before this event. `settled`: the clocks are
+    mapped by the round trips before this event; later requests to the modules do not change them.
     `deaf`: modules that did not confirm the stop of a failed session; None in an older journal, which names
     them in its text. `finished`: `cpu_us_per_message` is what receiving and recording a message cost.
     """
@@ -30,7 +34,7 @@ class JournalEvent(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     t_ns: int
-    what: Literal["session", "begin", "done", "motion", "note", "explored", "settled", "failed", "finished"]
+    what: What
     step: str = ""
     serial: str = ""
     boot: Annotated[int, Field(ge=0)] = 0
@@ -65,6 +69,12 @@ class JournalEvent(BaseModel):
         return self.model_dump_json(exclude_none=True).encode()
 
 
+def since_joined(journal: Sequence[JournalEvent]) -> Sequence[JournalEvent]:
+    """Return the events since modules joined the robot last; all of them if none did."""
+    begins = [place for place, event in enumerate(journal) if event.what == "anew"]
+    return journal[begins[-1] :] if begins else journal
+
+
 def standstill(journal: Sequence[JournalEvent]) -> str:
     """Return a sentence on whether the robot stands still after a session that failed."""
     if not journal or journal[-1].what != "failed":
@@ -86,6 +96,11 @@ def excluded_modules(journal: Sequence[JournalEvent]) -> dict[str, str]:
         elif event.what == "motion" and event.purpose in ("windowed_sine", "whole"):
             excluded.pop(event.serial, None)
     return excluded
+
+
+def exclusion_notes(journal: Sequence[JournalEvent]) -> tuple[str, ...]:
+    """Return a sentence on every excluded module."""
+    return tuple(f"{serial} took no part: {why}" for serial, why in excluded_modules(journal).items())
 
 
 def exclusion_event(t_ns: int, serial: str, why: str) -> JournalEvent:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.kinematics.chain_observations import RestObservation
-from coordinator.recording.journal import JournalEvent, Purpose
+from coordinator.recording.journal import JournalEvent, Purpose, since_joined
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind, module_type
 from module_agent.model.errors import DataError, RobotError
 from module_agent.wire.codec import decode
@@ -331,12 +331,12 @@ class Recording:
         """Return the motions of these purposes whose rows are those of their module's latest boot.
 
         A module that boots numbers its rows from zero again, and may have lost its joint zero: its earlier
-        motions do not describe the present robot.
+        motions do not describe the present robot. Nor do those before modules joined it.
         """
         boots = {serial: module.boot for serial, module in list(self.modules.items())}
         return [
             event
-            for event in list(self.journal)
+            for event in since_joined(list(self.journal))
             if event.what == "motion"
             and event.purpose in purposes
             and event.motion is not None

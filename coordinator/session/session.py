@@ -12,12 +12,12 @@ from typing import Protocol
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.live_robot.discovery import await_modules
-from coordinator.live_robot.errors import MotionInterrupted
+from coordinator.live_robot.errors import ModulesJoined, MotionInterrupted
 from coordinator.live_robot.excluded_modules import ExcludedModules
 from coordinator.live_robot.link_check import check_link
 from coordinator.live_robot.messenger import Clock, Messenger, Refused, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
-from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event
+from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event, since_joined
 from coordinator.recording.recording import Recording
 from coordinator.session.motion_selection import MotionChoice
 from coordinator.topology.next_motion import MAX_REPEATS, NextMotion
@@ -103,58 +103,113 @@ class Session:
         self._journal = journal
         self._reporter = reporter
         self._choice = MotionChoice(plan, recording, lambda: self._excluded.movers(), group.kind)
-        self._done = {e.step: e for e in recording.journal if e.what == "done"}
+        self._done = {e.step: e for e in since_joined(recording.journal) if e.what == "done"}
         self._index = 0
         self._total = 4
         self._keeper: asyncio.Task[None] | None = None
         self._excluded = ExcludedModules(group, self._note_exclusion)
+        # Modules that were there so far, and where the joints of those that take part stood.
+        self._known = frozenset[str]()
+        self._starts: dict[str, float] = {}
 
     # ------------------------------------------------------------------ the run
 
     async def run(self, expect: int | None = None) -> None:
-        """Discover, check, acquire, move and release; on an error, stop the robot and raise it."""
+        """Discover, check, acquire, move and release; on an error, stop the robot and raise it.
+
+        If modules join the robot meanwhile, all is measured again with them; where their number is said to be
+        as it was, this is an error.
+
+        Raises:
+            ModulesJoined: modules came that are not expected.
+        """
         await self._discover(expect)
         self._report("checking the network")
         await check_link(self.group, self._clock, self._plan.link_s, self._reporter.note)
-        serials = self.group.serials
-        explorations = (
-            1 if self._plan.mode == "simultaneous" else len(serials) + (self._plan.motions == "optimised")
-        )
-        self._total = (
-            6
-            + (self._plan.trial_speed_rad_s is not None)
-            + explorations
-            + (self._excitations(len(serials)) if self._plan.dynamics else 0)
-        )
+        self._total = 2 + self._steps()
         self._invalidate_steps_before_boot()
-        starts = {s: self._position(s) for s in serials}
+        self._starts = {s: self._position(s) for s in self.group.serials}
         try:
             # The keep-alives first: a lease must not expire while the next module is slow to answer.
             self._keeper = asyncio.create_task(self.group.keep_alive())
             await self._arm()
-            if self._plan.trial_speed_rad_s is not None:
-                work = partial(self._try_slowly, self._plan.trial_speed_rad_s)
-                await self._step("trial", "every joint slowly, a little", work)
-            await self._step_unless_excluded("home", "all joints to their home position", self._home)
-            await self._step("rest", "listening at rest", self._rest)
-            if self._plan.mode == "simultaneous":
-                await self._step("explore", "exploring all joints at once", self._explore_all)
-                single = await self._single_joints() if self._single_joints is not None else ()
-                self._total += len(single)
-                await self._explore_each(single)
-            else:
-                await self._explore_each(serials)
-                if self._plan.motions == "optimised" and not self._plan.topology_only:
-                    await self._step("explore", "exploring all joints at once", self._explore_all)
-            await self._settle_doubts()
-            self._report("topology and chain")
-            await self._reporter.explored()
-            if self._plan.dynamics:
-                await self._show_inertia()
-            await self._finish(starts)
+            while True:
+                try:
+                    await self._measure()
+                    break
+                except ModulesJoined as joined:
+                    if expect is not None:
+                        raise
+                    await self._begin_anew(joined)
+            await self._finish()
         except BaseException as error:
             await self._abandon(error)
             raise
+
+    def _steps(self) -> int:
+        """Return how many steps there are from the first motion on, as far as that is known before."""
+        joints = len(self.group.serials)
+        all_at_once = self._plan.mode == "simultaneous"
+        return (
+            4
+            + (self._plan.trial_speed_rad_s is not None)
+            + (1 if all_at_once else joints + (self._plan.motions == "optimised"))
+            + (self._excitations(joints) if self._plan.dynamics else 0)
+        )
+
+    async def _measure(self) -> None:
+        """Run all motions that show what the robot is.
+
+        Raises:
+            ModulesJoined: modules have come, and the robot stands still.
+        """
+        if self._plan.trial_speed_rad_s is not None:
+            work = partial(self._try_slowly, self._plan.trial_speed_rad_s)
+            await self._step("trial", "every joint slowly, a little", work)
+        await self._step_unless_excluded("home", "all joints to their home position", self._home)
+        await self._step("rest", "listening at rest", self._rest)
+        if self._plan.mode == "simultaneous":
+            await self._step("explore", "exploring all joints at once", self._explore_all)
+            single = await self._single_joints() if self._single_joints is not None else ()
+            self._total += len(single)
+            await self._explore_each(single)
+        else:
+            await self._explore_each(self.group.serials)
+            if self._plan.motions == "optimised" and not self._plan.topology_only:
+                await self._step("explore", "exploring all joints at once", self._explore_all)
+        await self._settle_doubts()
+        self._report("topology and chain")
+        await self._reporter.explored()
+        if self._plan.dynamics:
+            await self._show_inertia()
+
+    # ------------------------------------------------------------------ modules that join the robot
+
+    async def _look_for_joined(self) -> None:
+        """Register modules that have come and respond.
+
+        Raises:
+            ModulesJoined: there are some.
+        """
+        present = frozenset(self._messenger.alive)
+        before, new = self.group.serials, sorted(present - self._known)
+        self._known |= present
+        if not new:
+            return
+        await self._excluded.meet(new)
+        joined = [serial for serial in self.group.serials if serial not in before]
+        if joined:
+            raise ModulesJoined(joined, before)
+
+    async def _begin_anew(self, joined: ModulesJoined) -> None:
+        """Let modules take part that have joined the robot; what was measured before does not count."""
+        text = f"{joined}: the robot is measured anew with {'it' if len(joined.serials) == 1 else 'them'}"
+        self._reporter.note(text)
+        self._journal(JournalEvent(t_ns=self._clock(), what="anew", text=text))
+        self._done.clear()
+        self._starts |= {serial: self._position(serial) for serial in joined.serials}
+        await gather_all(self._arm_one(serial) for serial in joined.serials)
+        self._total = self._index + self._steps()
 
     async def _discover(self, expect: int | None) -> None:
         self._report("discovering modules")
@@ -170,6 +225,7 @@ class Session:
             names = ", ".join(sorted(known)) or "none"
             wanted = "at least one" if expect is None else str(expect)
             raise NoModulesFound(f"{wanted} module expected, found {len(known)}: {names}")
+        self._known = known
         await self._excluded.meet(sorted(known))
         if not self.group.serials:
             raise NoModulesFound(
@@ -227,6 +283,7 @@ class Session:
         serial = arguments[0] if arguments else ""
         boot = self.group.module(serial).boot if serial else 0
         self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
+        await self._look_for_joined()
 
     async def _step_unless_excluded(
         self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
@@ -249,14 +306,18 @@ class Session:
         await self._arm()
         await self._home()
 
-    async def _finish(self, starts: dict[str, float]) -> None:
+    async def _finish(self) -> None:
         speed = self._plan.travel_speed_rad_s
 
         async def back() -> None:
-            movers = self._excluded.movers()
-            await self.group.run({s: GoTo(target_rad=starts[s], max_speed_rad_s=speed) for s in movers})
+            goals = {s: self._starts[s] for s in self._excluded.movers() if s in self._starts}
+            await self.group.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in goals.items()})
 
-        await self._step("back", "back to where it stood", back)
+        try:
+            await self._step("back", "back to where it stood", back)
+        except ModulesJoined as late:
+            for serial in late.serials:
+                self._note_exclusion(serial, f"module {serial} came when all had been measured")
         await self.group.release_all()
         await self._stop_keeping()
         await self.group.close_gaps()

@@ -11,13 +11,15 @@ from typer.testing import CliRunner
 
 from coordinator.baseline.baseline_robot import BASELINE, BaselineRobot, load_baseline
 from coordinator.excitation.plan import Plan
+from coordinator.live_robot.errors import ModulesJoined
 from coordinator.main import app
-from coordinator.recording.run_folder import RESULT
+from coordinator.recording.run_folder import RESULT, load_recording
 from module_agent.model.chain import Chain
+from module_agent.wire.keys import Leaf, key
 from sim.robot.robot_file import Robot, load_robot
 from sim.scoring.score import score
 from sim.virtual_time.run import VirtualConfig, run_virtual
-from tests.rig import Notes
+from tests.rig import Notes, Rig
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("hot_plug")
@@ -165,3 +167,80 @@ def test_a_folder_that_holds_no_run_is_no_known_robot(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 2
     assert not (tmp_path / "new").exists()
+
+
+def _boots(rig: Rig, serial: str, during: str) -> None:
+    """Let a module join while a joint moves in the first step with these words."""
+    others = [s for s in rig.serials if s != serial]
+
+    def moves() -> bool:
+        return during in rig.notes[-1] and any(rig.state(s) == "moving" for s in others)
+
+    rig.when(lambda: bool(rig.notes) and moves(), lambda: rig.boot(serial))
+
+
+@pytest.mark.parametrize(("during", "dynamics"), [("exploring joint", False), ("exciting joint", True)])
+def test_a_module_that_joins_in_the_middle_of_a_session_is_measured_with_the_others(
+    rigs: Callable[..., Rig], quick_plan: Plan, tmp_path: Path, during: str, dynamics: bool
+) -> None:
+    rig = rigs(ARM, "lan", 2)
+    last = rig.serials[-1]
+    rig.kill(last)
+    _boots(rig, last, during)
+    plan = quick_plan.model_copy(update={"dynamics": dynamics})
+    result = rig.session(tmp_path / "run", plan, expects=False)
+    (said,) = [line for line in rig.notes if "in the middle of a session" in line]
+    assert said.startswith(f"module {last} came")
+    assert set(result.serials) == set(rig.serials)
+    found = score(tmp_path / "run")
+    assert found.topology_correct
+    for link in found.links:
+        assert link.link_length_error_mm is not None
+        assert link.link_length_sigma_mm is not None
+        assert abs(link.link_length_error_mm) < max(3.0 * link.link_length_sigma_mm, 1.0)
+    assert all(rig.state(serial) == "idle" for serial in rig.serials)
+    # A replay finds the same robot in the same recording.
+    again = CliRunner().invoke(
+        app, ["replay", str(tmp_path / "run" / "session.mcap"), "--out", str(tmp_path / "again")]
+    )
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "again" / RESULT).read_text() == (tmp_path / "run" / RESULT).read_text()
+
+
+def test_where_modules_are_counted_one_that_joins_ends_the_session_by_name(
+    rigs: Callable[..., Rig], quick_plan: Plan, tmp_path: Path
+) -> None:
+    rig = rigs(ARM, "lan", 2)
+    last = rig.serials[-1]
+    rig.kill(last)
+    _boots(rig, last, "exploring joint")
+    run = rig.begin(tmp_path / "run", quick_plan, expect=len(rig.serials) - 1)
+    with pytest.raises(ModulesJoined, match=f"module {last} came in the middle of a session"):
+        rig.run(run.run())
+    # It joined while a joint moved, and was seen when that had come to rest.
+    assert all(rig.state(serial) in ("stopped", "idle") for serial in rig.serials)
+    journal = load_recording(tmp_path / "run" / "session.mcap").journal
+    assert journal[-1].what == "failed"
+
+
+def test_a_token_without_a_module_disturbs_no_session(
+    rigs: Callable[..., Rig], quick_plan: Plan, tmp_path: Path
+) -> None:
+    rig = rigs("thesis_171_horizontal", "lan", 2)
+    ghost = rig.network.endpoint("ghost")
+    rig.at(3.0, lambda: ghost.declare_alive(key(rig.robot.name, "X-66666", Leaf.ALIVE)))
+    result = rig.session(tmp_path / "run", quick_plan, expects=False)
+    assert set(result.serials) == set(rig.serials)
+    assert any("going on without X-66666" in line for line in rig.notes)
+
+
+def test_a_module_that_joins_when_all_is_measured_is_no_part_of_the_result_and_that_is_said(
+    rigs: Callable[..., Rig], quick_plan: Plan, tmp_path: Path
+) -> None:
+    rig = rigs(ARM, "lan", 2)
+    last = rig.serials[-1]
+    rig.kill(last)
+    _boots(rig, last, "back to where it stood")
+    result = rig.session(tmp_path / "run", quick_plan, expects=False)
+    assert set(result.serials) == set(rig.serials) - {last}
+    assert any(last in note and "when all had been measured" in note for note in result.notes)
