@@ -17,6 +17,7 @@ import mmap
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
+from pydantic import BaseModel
 from zstandard import ZstdError
 
 from coordinator.recording.journal import JournalEvent
@@ -51,6 +53,12 @@ _OPCODES = frozenset(map(int, Opcode))
 _UNREADABLE = (McapError, ZstdError, EndOfFile, struct.error, ValueError, MemoryError)
 
 KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
+
+
+@cache
+def _schema(message_type: type[BaseModel]) -> bytes:
+    """Return the JSON schema of a message; a process that records many sessions makes each once."""
+    return json.dumps(message_type.model_json_schema()).encode()
 
 
 class SessionFileError(RobotError):
@@ -119,8 +127,7 @@ class SessionWriter:
         message_type = JournalEvent if kind == "journal" else TOPICS[parse(topic).leaf].message(kind) or Ack
         name = f"x5.{message_type.__name__}"
         if name not in self._schemas:
-            schema = json.dumps(message_type.model_json_schema()).encode()
-            self._schemas[name] = self._writer.register_schema(name, "jsonschema", schema)
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", _schema(message_type))
         channel = self._writer.register_channel(
             topic=topic,
             message_encoding="json" if kind == "journal" else "msgpack",

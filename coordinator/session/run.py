@@ -118,6 +118,7 @@ class RunConfig(NamedTuple):
     report: write a page for people into the folder, of a run that ends early too.
     max_bytes: of the recording; a run that reaches it stops the robot and ends.
     gate: every motion passes it before it is commanded; None if the robot may do all that is planned.
+    keeps_view: write what the viewer shows into the folder.
     """
 
     robot: str
@@ -134,6 +135,7 @@ class RunConfig(NamedTuple):
     report: bool = False
     max_bytes: int | None = None
     gate: MotionGate | None = None
+    keeps_view: bool = True
 
 
 class _Undisturbed:
@@ -197,7 +199,7 @@ class Run:
         self.recording = Recording()
         self._writer = SessionWriter(config.out / SESSION, config.max_bytes)
         self._session: asyncio.Task[Any] | None = None
-        targets = config.viewer._replace(rrd=config.out / VIEW)
+        targets = config.viewer._replace(rrd=config.out / VIEW) if config.keeps_view else config.viewer
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(viewer, self.recording, overlay)
         self._previewer = Previewer(self.recording, config.refined_previews)

@@ -21,7 +21,7 @@ from sim.faults.schedule import Schedule, draw, first_modules
 
 _RANGE = re.compile(r"(\d{1,12})\.\.(\d{1,12})\Z")
 # Processor time of a seed [s].
-COST_S = 3.0
+COST_S = 1.0
 
 
 def faults(

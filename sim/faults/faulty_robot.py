@@ -1,8 +1,10 @@
 """A robot that can be broken at will: its agents, its motors, its supply, and what its sensors read."""
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from sim.virtual_time.loop import NS_PER_S, VirtualLoop
 from sim.virtual_time.network import VirtualNetwork
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings, Wire
 from sim.world.truth import TruthLog
-from sim.world.world import TICK_NS
+from sim.world.world import TICK_NS, World
 
 # Friction of a motor that something holds, and the winding of one that is too hot, above the ambient [K].
 STALLED, HOT_K, HOTTEST_K = 1e3, 100.0, 60.0
@@ -30,9 +32,26 @@ TWIN_BOOT = 2**40
 class _SickTruth(TruthLog):
     """Steps the world; what it returns is what the modules read."""
 
-    def __init__(self, robot: VirtualRobot, faults: Sequence[Fault]):
-        super().__init__(robot.world)
-        self._sensors = SickSensors(faults, len(robot.serials))
+    def __init__(self, world: World, faults: Sequence[Fault]):
+        super().__init__(world)
+        self._sensors = SickSensors(faults, len(world.modules))
+
+    @property
+    def readings(self) -> Readings:
+        """What the modules have read in the last tick, sick sensors included."""
+        return self.world.readings if self.alteration is None else self._sensors.own
+
+    @property
+    def alteration(self) -> Any:
+        """What the present faults make of the sensors' readings."""
+        return self._sensors.alteration
+
+    @property
+    def ticks_ahead(self) -> int:
+        """How many ticks there are before a fault begins or ends; 0 in the tick in which one does."""
+        most = super().ticks_ahead
+        spare_ns = min(max(self._sensors.spare_ns(self.world.t_ns), 0.0), most * TICK_NS)
+        return math.ceil(spare_ns / TICK_NS)
 
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Step the world and return what the modules read of it."""
@@ -49,13 +68,16 @@ class FaultyRobot(VirtualRobot):
     def __init__(
         self, settings: VirtualSettings, loop: VirtualLoop, network: VirtualNetwork, faults: Sequence[Fault]
     ):
+        self._faults = faults
         super().__init__(settings, loop, network)
-        self.truth = _SickTruth(self, faults)
         self._away: dict[str, AgentHost] = {}
         self._sags: list[Fault] = []
         for fault in faults:
             if fault.kind == "hot plug":
                 self._crash(fault)
+
+    def _truth_of(self, world: World) -> TruthLog:
+        return _SickTruth(world, self._faults)
 
     def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
         """Boot ids in order: agents can be started any number of times."""

@@ -3,8 +3,10 @@
 The witness sees the plant and the bytes on the wire, and neither the firmware's state nor its opinion.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
 from module_agent.model.catalogue import module_type
@@ -12,8 +14,11 @@ from module_agent.wire.codec import decode
 from module_agent.wire.keys import KeyParts, Leaf, parse
 from module_agent.wire.messages import Ack, LeaseRequest
 from module_agent.wire.refusal import WireError
+from sim.geometry.pose import Array
+from sim.virtual_time.quiet_run import ASKED
 from sim.virtual_time.robot import VirtualRobot
 from sim.world.world import TICK_NS
+from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM
 
 LIFETIME_NS = 250_000_000
 COMMANDS = (Leaf.LEASE, Leaf.MOTION, Leaf.SETPOINT, Leaf.GAINS)
@@ -108,46 +113,58 @@ class PlantWitness:
         asked = _Request(endpoint, request.action == "acquire")
         self._requests.setdefault((serial, request.sender, request.seq), asked)
 
-    def check(self, robot: VirtualRobot) -> None:
-        """Judge what the motors did in the tick that ends."""
-        t_ns = robot.world.t_ns - TICK_NS
-        if t_ns % (SPEED_TICKS * TICK_NS) == 0:
-            self._check_speeds(robot)
+    def check(self, robot: VirtualRobot, seen: Array) -> None:
+        """Judge what the motors did in the ticks (T, rows, n) that have just ended; see `QuietRun.seen`."""
+        first_ns = robot.world.t_ns - len(seen) * TICK_NS
+        self._check_asked(robot.serials, first_ns, seen[:, ASKED])
+        first_look = -(first_ns // TICK_NS) % SPEED_TICKS
+        if first_look < len(seen):
+            looked_ns = first_ns + first_look * TICK_NS
+            self._check_speeds(robot, looked_ns, seen[first_look::SPEED_TICKS, PLANT_MOTOR_RAD_S])
         for k, serial in enumerate(robot.serials):
-            # What the module asks its bridge for: the plant's bridge clips it.
-            asked = float(robot.pwm[k])
-            if not abs(asked) <= MAX_PWM:
-                text = (
-                    f"module {serial} at {t_ns / 1e9:.3f} s asked {asked:.3f}, expected at most {MAX_PWM:.0f}"
-                )
-                self._note("PWM out of range", text)
             commanded_ns = min(
                 self._sent_ns.get(serial, -LIFETIME_NS), self._accepted_ns.get(serial, -LIFETIME_NS)
             )
-            late_ns = t_ns - commanded_ns - LIFETIME_NS
-            if late_ns > 2 * TICK_NS:
-                self._check_off(robot, k, late_ns)
+            ended_ns = commanded_ns + LIFETIME_NS
+            # The first tick that is later than by two.
+            late = max((ended_ns - first_ns) // TICK_NS + 3, 0)
+            if late < len(seen) and seen[late:, PLANT_PWM, k].any():
+                rows = seen[late:, (PLANT_PWM, PLANT_MOTOR_RAD_S), k].tolist()
+                for tick, (pwm, speed) in enumerate(rows, late):
+                    self._check_off(serial, first_ns + tick * TICK_NS, ended_ns, pwm, speed)
 
-    def _check_speeds(self, robot: VirtualRobot) -> None:
-        for serial, module, speed in zip(
-            robot.serials, robot.robot.modules, robot.world.plant.motor_rad_s.tolist(), strict=True
-        ):
-            limit = module_type(module.type).max_speed_rad_s
-            if not abs(speed) <= SPEED_MARGIN * limit:
-                text = f"module {serial} at {robot.world.t_ns / 1e9:.3f} s: {speed:.2f} rad/s of {limit:.2f}"
-                self._note("speed beyond the limit", text)
+    def _check_asked(self, serials: Sequence[str], first_ns: int, asked: Array) -> None:
+        """Judge what the modules ask their bridges for, (T, n): the plant's bridges clip it."""
+        if np.abs(asked).max() <= MAX_PWM:
+            return
+        # Nor is what is not a number within it.
+        tick, k = np.argwhere(~(np.abs(asked) <= MAX_PWM))[0].tolist()
+        text = (
+            f"module {serials[k]} at {(first_ns + tick * TICK_NS) / 1e9:.3f} s asked {asked[tick, k]:.3f}, "
+            f"expected at most {MAX_PWM:.0f}"
+        )
+        self._note("PWM out of range", text)
 
-    def _check_off(self, robot: VirtualRobot, k: int, late_ns: int) -> None:
+    def _check_speeds(self, robot: VirtualRobot, first_ns: int, speeds: Array) -> None:
+        limits = np.array([module_type(module.type).max_speed_rad_s for module in robot.robot.modules])
+        within = np.abs(speeds) <= SPEED_MARGIN * limits
+        if within.all():
+            return
+        tick, k = np.argwhere(~within)[0].tolist()
+        at_s = (first_ns + (tick * SPEED_TICKS + 1) * TICK_NS) / 1e9
+        text = f"module {robot.serials[k]} at {at_s:.3f} s: {speeds[tick, k]:.2f} rad/s of {limits[k]:.2f}"
+        self._note("speed beyond the limit", text)
+
+    def _check_off(self, serial: str, t_ns: int, ended_ns: int, pwm: float, speed: float) -> None:
         """Judge a motor that is commanded no more: off, or braking after a stop."""
-        plant, serial = robot.world.plant, robot.serials[k]
         # The brake follows the motor's speed, which a spring keeps apart from the output's.
-        pwm, speed = float(plant.pwm[k]), float(plant.motor_rad_s[k])
         if pwm == 0.0:
             return
         brakes = abs(pwm) <= DAMPING_LIMIT_PWM and (abs(speed) < SLOW_RAD_S or pwm * speed <= 0.0)
         if serial not in self._stopped or not brakes:
-            where = f"module {serial} at {plant.t_ns / 1e9:.3f} s: PWM {pwm:.3f}"
-            self._note("driven too late", f"{where}, {late_ns / 1e6:.0f} ms after its lifetime ended")
+            where = f"module {serial} at {t_ns / 1e9:.3f} s: PWM {pwm:.3f}"
+            late_ms = (t_ns - ended_ns) / 1e6
+            self._note("driven too late", f"{where}, {late_ms:.0f} ms after its lifetime ended")
 
     def _note(self, kind: str, text: str) -> None:
         self.violations.setdefault(kind, text)

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import os
 import resource
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +10,7 @@ from typing import NamedTuple
 
 from coordinator.identification.result import Result
 from coordinator.live_robot.messenger import Sender
-from coordinator.recording.run_folder import RESULT, SESSION, VIEW
+from coordinator.recording.run_folder import RESULT, SESSION
 from coordinator.runtime.event_loop import end_tasks
 from coordinator.session.run import Run, RunConfig
 from module_agent.model.errors import RobotError
@@ -76,7 +75,7 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
     settings = VirtualSettings(schedule.robot, network(schedule.network), schedule.seed, "x5")
     robot = FaultyRobot(settings, loop, VirtualNetwork(loop, tap), schedule.faults)
     session = _Session(schedule, robot, out, taps)
-    robot.on_tick.append(lambda: witness.check(robot))
+    robot.on_run.append(partial(witness.check, robot))
     try:
         return session.run()
     finally:
@@ -105,9 +104,6 @@ class _Session:
     def run(self) -> Ending:
         robot, loop = self._robot, self._robot.loop
         robot.start()
-        # The view is looked at by no invariant, and its library waits for ever where its file cannot grow.
-        self._out.mkdir()
-        (self._out / VIEW).symlink_to(os.devnull)
         for fault in self._schedule.faults:
             if fault.kind == "intruder":
                 self._await_intruder(fault)
@@ -123,7 +119,6 @@ class _Session:
         limit_file_size(None)
         if ending.name == "result":
             write_truth(self._out / "truth.json", robot.world.robot)
-            robot.truth.save(self._out / "truth.npz")
         return ending
 
     def _coordinate(self, resume: bool) -> Ending:
@@ -137,6 +132,8 @@ class _Session:
             resume=resume,
             inline=True,
             refined_previews=0,
+            # No invariant looks at it, and its library waits for ever where its file cannot grow.
+            keeps_view=False,
         )
         cable = Cable(robot.endpoint(self._sender), loop, self._cable)
         task: asyncio.Task[Result] | None = None

@@ -67,6 +67,8 @@ class VirtualLoop(asyncio.BaseEventLoop):
         What was given to `schedule_ns` goes on. To be called from such a call; timers run late, in order.
         """
         until_ns, late = self._now_ns + for_ns, list[_Entry]()
+        # Calls that let time pass go no further.
+        self._push(until_ns, lambda: None, None)
         try:
             while self._heap and self._heap[0][0] <= until_ns:
                 entry = heapq.heappop(self._heap)
@@ -75,8 +77,6 @@ class VirtualLoop(asyncio.BaseEventLoop):
                     continue
                 self._now_ns = entry[0]
                 entry[2]()
-            # What ran may have let more time pass than that.
-            self._now_ns = max(self._now_ns, until_ns)
         finally:
             for due_ns, _, call, timer in late:
                 self._push(due_ns, call, timer)

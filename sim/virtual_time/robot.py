@@ -20,6 +20,7 @@ from module_agent.host import AgentHost, InlineWorker
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.transport.transport import Transport
+from sim.geometry.pose import Array
 from sim.hebi_stand_in.library import Group, StandIn
 from sim.hebi_stand_in.modules import ModuleNetwork
 from sim.imperfections.noise_profile import NoiseProfile
@@ -33,9 +34,6 @@ from sim.world.truth import TruthLog
 from sim.world.world import TICK_NS, World
 
 T = TypeVar("T")
-
-# The ticks of a call in which nothing else happens.
-_MANY_TICKS = 256
 
 
 class VirtualSettings(NamedTuple):
@@ -95,7 +93,9 @@ class VirtualRobot:
     """Ticks the world and all agents once a virtual millisecond.
 
     Every agent has its own endpoint on the network, impaired by separate draws, like an agent process.
-    `pwm` is what the motors get in the next tick; `on_tick` are called at the end of every tick.
+    `pwm` is what the motors get in the next tick; `on_tick` are called at the end of every tick. `on_run` are
+    called after a call of one or more ticks, before what their agents do is sent: they receive what
+    `QuietRun.seen` has of each.
 
     Args:
         settings: robot, network, noise and seeds.
@@ -120,7 +120,7 @@ class VirtualRobot:
         }
         self.world = World(settings.robot, settings.seed, settings.noise, **options)
         self.network = VirtualNetwork(loop) if network is None else network
-        self.truth = TruthLog(self.world)
+        self.truth = self._truth_of(self.world)
         self.pwm = [0.0] * len(self.serials)
         self._quiet = QuietTicks(len(self.serials))
         self._hebi_rate_hz = settings.hebi_rate_hz
@@ -128,6 +128,7 @@ class VirtualRobot:
         self._ticks = 0
         self._run = QuietRun(self.world, self.truth, self._quiet)
         self.on_tick: list[Callable[[], None]] = []
+        self.on_run: list[Callable[[Array], None]] = []
         self._profile = settings.profile
         self._safety = settings.safety
         self._endpoint_seeds, self._boot_ids = self._draws(settings)
@@ -136,6 +137,10 @@ class VirtualRobot:
         for serial in self.serials:
             self.boot(serial)
         self._running = False
+
+    def _truth_of(self, world: World) -> TruthLog:
+        """Return what steps the world, and gives the modules its readings."""
+        return TruthLog(world)
 
     def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
         """Return the seeds of endpoints, and boot ids."""
@@ -206,15 +211,20 @@ class VirtualRobot:
         """Let all agents tick, with the loops of their modules."""
         hosts, quiet = list(self.hosts.items()), self._quiet
         busy = [place for _, host in hosts for place in host.collect()]
-        if self.on_tick or not self.truth.can_run_ahead:
+        ahead, ticks = 0 if self.on_tick else self.truth.ticks_ahead, 1
+        if not ahead:
             readings = self.truth.exchange(self.pwm)
             results = quiet.run(readings, busy)
+            self._run.see(self.pwm)
         else:
-            readings = self.world.readings
             alone = not busy and not any(host.has_work for _, host in hosts)
             alive = [self._index[serial] for serial, _ in hosts]
-            ticks, results = self._run.run(self.pwm, alive, busy, self._ticks_alone() if alone else 1)
+            most = self._ticks_alone(ahead) if alone else 1
+            ticks, results = self._run.run(self.pwm, alive, busy, most)
+            readings = self.truth.readings
             self.loop.pass_ns((ticks - 1) * TICK_NS)
+        for see in self.on_run:
+            see(self._run.seen[:ticks])
         for serial, host in hosts:
             if results[self._index[serial]] != QUIET or host.has_work:
                 host.finish(readings, results)
@@ -222,10 +232,10 @@ class VirtualRobot:
         for serial, _ in hosts:
             self.pwm[self._index[serial]] = pwm[self._index[serial]]
 
-    def _ticks_alone(self) -> int:
-        """Return how many ticks there are, this one included, before anything else happens."""
+    def _ticks_alone(self, most: int) -> int:
+        """Return how many ticks there are, this one included, before anything else happens, or `most`."""
         free_ns = self.loop.free_ns
-        return _MANY_TICKS if free_ns is None else min(max(1 + (free_ns - 1) // TICK_NS, 1), _MANY_TICKS)
+        return most if free_ns is None else min(max(1 + (free_ns - 1) // TICK_NS, 1), most)
 
     def kill(self, serial: str) -> None:
         """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone.

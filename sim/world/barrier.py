@@ -112,7 +112,7 @@ def rehearse(world: TruthLog | None) -> None:
     pwm = np.zeros(0 if world is None else len(world.modules))
     nothing.distribute(0, Readings(1), nothing.collect(0, pwm))
     keep_pace(pace := new_pace(0, 0, 0), packets.work_space())
-    if world is not None and world.can_run_ahead:
+    if world is not None and world.ticks_ahead:
         nothing.run(world, 0, 0, pwm, pace)
 
 

@@ -217,7 +217,7 @@ class BusServer:
         world = self._world
         try:
             while not stop():
-                if isinstance(world, TruthLog) and world.can_run_ahead:
+                if isinstance(world, TruthLog) and world.ticks_ahead:
                     self._run_ahead(world, pace)
                 elif keep_pace(pace, self._clock):
                     self.tick()

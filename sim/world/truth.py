@@ -25,6 +25,8 @@ from sim.world.world import TICK_NS, World
 from sim.world.world_kernel import keep_truth
 
 VERSION = 1
+# The ticks of a call in which nothing else happens.
+MANY_TICKS = 256
 # Rows of a `TruthLog` to begin with.
 _ROWS = 4096
 
@@ -132,9 +134,19 @@ class TruthLog:
         return samples
 
     @property
-    def can_run_ahead(self) -> bool:
-        """Whether a kernel can do what `exchange` does, for any number of ticks."""
-        return type(self).exchange is TruthLog.exchange and self.world.can_run_ahead
+    def readings(self) -> Readings:
+        """What the modules have read in the last tick; the next one overwrites it."""
+        return self.world.readings
+
+    @property
+    def alteration(self) -> Any:
+        """What a kernel has to alter in the readings, an `Alteration` as a plain tuple; None if nothing."""
+        return None
+
+    @property
+    def ticks_ahead(self) -> int:
+        """How many ticks a kernel can do as `exchange` does; 0 if none."""
+        return MANY_TICKS if self.world.can_run_ahead else 0
 
     def begin_run(self, ticks: int) -> tuple[Any, ...]:
         """Return arrays with room for so many ticks: times, rows, and counts, as `keep_truth` takes them."""

@@ -11,8 +11,8 @@ import pytest
 
 from module_agent.model.errors import RobotError
 from module_agent.wire.messages import GoTo
-from sim.virtual_time import robot as virtual_robot
 from sim.virtual_time.quiet_run import QuietRun
+from sim.world import truth
 from sim.world.external_force import Push
 from sim.world.world import TICK_NS
 
@@ -65,6 +65,8 @@ def life(rigs: Callable[..., Any], seed: int, observed: bool = False) -> tuple[s
 
     network, noise = (("none", "lan", "wifi")[int(rng.integers(3))], ("x5", "poor")[int(rng.integers(2))])
     rig = rigs(ROBOTS[seed % len(ROBOTS)], network, seed, tap, noise)
+    seen: list[bytes] = []
+    rig.on_run.append(lambda ticks: seen.append(ticks.tobytes()))
     if observed:
         rig.on_tick.append(lambda: None)
     _, _, group = rig.group()
@@ -91,6 +93,7 @@ def life(rigs: Callable[..., Any], seed: int, observed: bool = False) -> tuple[s
     motion, plant = rig.truth.motion(), rig.world.plant
     for values in (*motion[1:], *plant[1:], rig.world.readings.floats):
         trace.update(np.ascontiguousarray(values).tobytes())
+    trace.update(b"".join(seen))
     for serial, host in sorted(rig.hosts.items()):
         history = host.modules[0].firmware.history
         trace.update(serial.encode() + history.block(history.first_row, history.next_row))
@@ -115,7 +118,7 @@ def test_many_ticks_in_one_call_leave_what_one_at_a_time_leaves(
     calls.clear()
     assert life(rigs, seed, observed=True) == many
     assert calls == []
-    monkeypatch.setattr(virtual_robot, "_MANY_TICKS", 1)
+    monkeypatch.setattr(truth, "MANY_TICKS", 1)
     assert life(rigs, seed) == many
     assert set(calls) == {1}
 

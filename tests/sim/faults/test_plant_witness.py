@@ -10,6 +10,8 @@ from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, LeaseRequest
 from sim.faults.plant_witness import LIFETIME_NS, PlantWitness
+from sim.virtual_time.quiet_run import ASKED, SEEN_ROWS
+from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM
 
 ROBOT, SERIAL, HOLDER = "arm", "A", "coordinator"
 MS = 1_000_000
@@ -21,18 +23,18 @@ class Scene:
 
     def __init__(self) -> None:
         self.witness = PlantWitness([HOLDER])
-        self._now_ns = self._seq = 0
+        self.now_ns = self._seq = 0
 
     def accept(self, leaf: Leaf, action: Literal["acquire", "renew"] | None = None) -> None:
         """Let the coordinator ask for something which the module grants."""
-        self._now_ns += MS
+        self.now_ns += MS
         self._seq += 1
         at = key(ROBOT, SERIAL, leaf)
         payload = b""
         if action is not None:
             head: dict[str, Any] = {"serial": SERIAL, "boot": 1, "seq": self._seq, "sender": HOLDER}
             payload = encode(LeaseRequest(**head, token=1, echo_ns=1, action=action))
-        self.witness.tap(self._now_ns, HOLDER, "request", at, payload)
+        self.witness.tap(self.now_ns, HOLDER, "request", at, payload)
         answer = Ack(
             serial=SERIAL,
             boot=1,
@@ -46,20 +48,22 @@ class Scene:
             lease_left_ns=1000 * MS,
             token=1,
         )
-        self.witness.tap(self._now_ns, SERIAL, "reply", at, encode(answer))
+        self.witness.tap(self.now_ns, SERIAL, "reply", at, encode(answer))
 
     def judged(self, pwm: float, speed_rad_s: float) -> set[str]:
         """Return what the witness notes of a motor that is driven after the lifetime of the last command."""
-        plant = SimpleNamespace(
-            pwm=np.array([pwm]), motor_rad_s=np.array([speed_rad_s]), t_ns=self._now_ns + LATE_NS
-        )
+        seen = np.zeros((1, SEEN_ROWS, 1))
+        seen[0, [PLANT_PWM, ASKED]], seen[0, PLANT_MOTOR_RAD_S] = pwm, speed_rad_s
+        return self.looked(seen, self.now_ns + LATE_NS)
+
+    def looked(self, seen: np.ndarray, from_ns: int) -> set[str]:
+        """Return what the witness notes of ticks (T, rows, 1) of the motor from a time on."""
         robot: Any = SimpleNamespace(
             serials=(SERIAL,),
-            pwm=[pwm],
-            world=SimpleNamespace(t_ns=self._now_ns + LATE_NS + MS, plant=plant),
+            world=SimpleNamespace(t_ns=from_ns + len(seen) * MS),
             robot=SimpleNamespace(modules=[SimpleNamespace(type="X5-9")]),
         )
-        self.witness.check(robot)
+        self.witness.check(robot, seen)
         return set(self.witness.violations)
 
 
@@ -89,3 +93,29 @@ def test_a_module_that_was_armed_after_a_stop_is_stopped_no_more() -> None:
     scene.accept(Leaf.STOP)
     scene.accept(Leaf.LEASE, "acquire")
     assert scene.judged(pwm=0.018, speed_rad_s=-0.5) == {"driven too late"}
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "kind"),
+    [
+        (PLANT_PWM, 0.3, "driven too late"),
+        (ASKED, -1.2, "PWM out of range"),
+        (ASKED, np.nan, "PWM out of range"),
+        (PLANT_MOTOR_RAD_S, 3.0, "speed beyond the limit"),
+    ],
+)
+def test_one_tick_among_many_is_seen(row: int, value: float, kind: str) -> None:
+    seen = np.zeros((64, SEEN_ROWS, 1))
+    seen[40:48, row] = value
+    scene = armed()
+    assert scene.looked(seen, scene.now_ns + LATE_NS) == {kind}
+    assert scene.looked(np.zeros_like(seen), scene.now_ns + LATE_NS) == {kind}
+
+
+def test_a_motor_may_be_driven_until_two_ticks_after_the_lifetime() -> None:
+    """In a run of ticks that begins before that and ends after it."""
+    seen = np.zeros((64, SEEN_ROWS, 1))
+    for last, found in ((42, set()), (43, {"driven too late"})):
+        seen[: last + 1, PLANT_PWM] = 0.3
+        scene = armed()
+        assert scene.looked(seen, scene.now_ns + LIFETIME_NS - 40 * MS) == found

@@ -1,13 +1,21 @@
 """A sick sensor changes what it reads while its fault lasts, and nothing else of the robot."""
 
+import asyncio
 import math
 
 import numpy as np
 import pytest
 
 from module_agent.hardware.hardware import Readings, SensorSample
-from sim.faults.fault import Fault
+from module_agent.network_emulation.profile import PROFILES
+from sim.faults.fault import NATURES, Fault
+from sim.faults.faulty_robot import FaultyRobot
+from sim.faults.schedule import first_modules
 from sim.faults.sick_sensors import DRIFT, FULL_SCALE, JUMP_RAD, JUMP_S, SickSensors
+from sim.robot.robot_file import load_robot
+from sim.virtual_time.loop import VirtualLoop
+from sim.virtual_time.network import VirtualNetwork
+from sim.virtual_time.robot import VirtualSettings
 
 FIELDS = SensorSample._fields
 GYRO_X, IMU = (
@@ -98,3 +106,32 @@ def test_two_sick_sensors_are_sick_together() -> None:
     assert both[250, 0, 0] == pytest.approx(0.1 * JUMP_RAD)
     assert math.isnan(both[250, 0, FIELDS.index("effort_nm") - 2])
     assert both[350, 0, FIELDS.index("effort_nm") - 2] == 0.0
+
+
+def rows_of_all(one_at_a_time: bool) -> tuple[list[bytes], int]:
+    """Return the rows that two modules keep of 2 s with all faults of sensors, and the calls of ticks."""
+    kinds = [kind for kind, nature in NATURES.items() if nature.part in ("clock", "encoder", "imu", "torque")]
+    faults = [
+        Fault(kind, 0.2 + 0.1 * k, math.inf if NATURES[kind].ends == "never" else 0.25, k % 2, 0.3 + 0.04 * k)
+        for k, kind in enumerate(kinds)
+    ]
+    settings = VirtualSettings(first_modules(load_robot("thesis_171_vertical"), 2), PROFILES["none"], 1, "x5")
+    loop, calls = VirtualLoop(), list[int]()
+    robot = FaultyRobot(settings, loop, VirtualNetwork(loop), faults)
+    robot.on_run.append(lambda seen: calls.append(len(seen)))
+    if one_at_a_time:
+        robot.on_tick.append(lambda: None)
+    robot.start()
+    loop.run_until_complete(asyncio.sleep(2.0))
+    histories = [robot.hosts[serial].modules[0].firmware.history for serial in robot.serials]
+    rows = [history.block(history.first_row, history.next_row) for history in histories]
+    robot.close()
+    loop.close()
+    return rows, len(calls)
+
+
+def test_sick_sensors_read_the_same_in_runs_of_many_ticks() -> None:
+    many, calls = rows_of_all(one_at_a_time=False)
+    single, ticks = rows_of_all(one_at_a_time=True)
+    assert many == single
+    assert calls < 0.6 * ticks

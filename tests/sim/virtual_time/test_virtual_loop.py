@@ -273,6 +273,18 @@ def test_frozen_tasks_stand_still_while_the_world_goes_on_and_then_run_late_in_o
     ]
 
 
+def test_a_call_that_lets_time_pass_in_a_freeze_passes_no_more_than_there_is_of_it() -> None:
+    free: list[int | None] = []
+
+    async def main() -> None:
+        loop().schedule_ns(10, lambda: loop().freeze_tasks(100))
+        loop().schedule_ns(30, lambda: free.append(loop().free_ns))
+        await asyncio.sleep(20e-9)
+
+    run(main())
+    assert free == [80]
+
+
 def test_what_ends_a_freeze_early_loses_no_timer() -> None:
     async def main() -> None:
         def fail() -> None:

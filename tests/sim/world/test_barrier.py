@@ -34,7 +34,7 @@ def test_the_world_behind_a_bus_moves_as_one_that_is_stepped_by_hand(tmp_path: P
     """To the bit, samples and truth, from whatever tick the agents are in step."""
     robot, path = load_robot(ROBOT), str(tmp_path / "bus")
     log = TruthLog(World(robot, SEED))
-    assert log.can_run_ahead
+    assert log.ticks_ahead
     pwm = 0.3 * np.sin(np.outer(np.arange(TICKS), 0.02 + 0.01 * np.arange(len(robot.serials))))
     # One agent has the modules in the opposite order.
     serials = robot.serials[::-1]
