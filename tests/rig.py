@@ -33,7 +33,7 @@ class Notes:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def step(self, index: int, total: int, text: str) -> None:
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
         self.lines.append(f"[{index}/{total}] {text}")
 
     def note(self, text: str) -> None:

@@ -4,7 +4,8 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -15,11 +16,14 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from module_agent.model.errors import EXIT_FAILED, UsageError
 from module_agent.model.files import json_text, write_json
@@ -139,6 +143,25 @@ class _StandardError(Console):
         signal.raise_signal(signal.SIGHUP)
 
 
+class TimeLeft(ProgressColumn):
+    """Time left to the task's `end_s`, which was expected; without one as the steps so far tell."""
+
+    max_refresh = 0.5
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        super().__init__()
+        self._now_s = now_s
+        self._by_steps = TimeRemainingColumn()
+
+    def render(self, task: Task) -> Text:
+        """Return the time left, of which nothing is known any more once it is over."""
+        end_s = task.fields.get("end_s")
+        if end_s is None:
+            return self._by_steps.render(task)
+        minutes, seconds = divmod(round(end_s - self._now_s()), 60)
+        return Text("-:--" if minutes < 0 else f"{minutes}:{seconds:02}", style="progress.remaining")
+
+
 class Terminal(Displayed):
     """Progress and notes on standard error, so that standard output stays for results."""
 
@@ -150,7 +173,7 @@ class Terminal(Displayed):
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
-            TimeRemainingColumn(),
+            TimeLeft(time.monotonic),
             console=console,
             transient=True,
         )
@@ -162,9 +185,11 @@ class Terminal(Displayed):
         if self._display is not None:
             self._progress.update(self._task, description=text, completed=done, total=total)
 
-    def step(self, index: int, total: int, text: str) -> None:
-        """Show that a step begins."""
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
+        """Show that a step begins, and how long all that is left is expected to take."""
         if self._display is not None:
-            self._progress.update(self._task, description=text, completed=index - 1, total=total)
+            end_s = None if left_s is None else time.monotonic() + left_s
+            self._progress.update(self._task, description=text, completed=index - 1, total=total, end_s=end_s)
         else:
-            self.console.print(f"[{index}/{total}] {text}", markup=False, soft_wrap=True)
+            left = f" ({left_s:.0f} s left)" if left_s else ""
+            self.console.print(f"[{index}/{total}] {text}{left}", markup=False, soft_wrap=True)

@@ -31,6 +31,7 @@ from module_agent.wire.messages import (
     MultiSine,
     OtherMotion,
     Pattern,
+    Rest,
     WindowedSine,
 )
 
@@ -45,6 +46,21 @@ ANSWERS_S = 0.3
 # A repetition must reduce the predicted sigma by this share.
 MIN_GAIN_SHARE = 0.05
 MAX_MOTIONS = 8
+# How far a slow trial moves every joint to either side.
+TRIAL_RAD = 0.08
+# Rest of a run that moves all joints at once, for speed: 1 s determines the gyros' biases to 0.1 mrad/s.
+SIMULTANEOUS_REST_S = 1.0
+
+
+def resting(plan: Plan) -> Rest:
+    """Return the motion of modules that listen at rest."""
+    longest_s = SIMULTANEOUS_REST_S if plan.mode == "simultaneous" else plan.rest_s
+    return Rest(duration_s=min(longest_s, plan.rest_s))
+
+
+def joint_budget_s(plan: Plan, joints: int) -> float:
+    """Return how long exploring one of so many joints by designed motions may take."""
+    return plan.joint_s or float(np.clip(DESIGNED_JOINT_S - AROUND_S / joints, MIN_JOINT_S, MAX_JOINT_S))
 
 
 class MotionChoice:
@@ -113,7 +129,6 @@ class MotionChoice:
 
     def _task(self, serial: str, limits: JointLimits) -> JointTask:
         force = self._recording.rest_rows(serial)["accel_m_s2"].astype(float).mean(axis=0)
-        designed_s = np.clip(DESIGNED_JOINT_S - AROUND_S / len(self._serials()), MIN_JOINT_S, MAX_JOINT_S)
         return JointTask(
             limits,
             float(force[2] / np.linalg.norm(force)),
@@ -121,7 +136,7 @@ class MotionChoice:
             self._plan.home_rad,
             self._plan.travel_speed_rad_s,
             self._plan.settle_s,
-            (self._plan.joint_s or float(designed_s)) - 2.0 * ANSWERS_S,
+            joint_budget_s(self._plan, len(self._serials())) - 2.0 * ANSWERS_S,
             self._radius_m(serial),
         )
 

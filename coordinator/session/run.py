@@ -144,10 +144,10 @@ class _Undisturbed:
     def __init__(self, screen: Screen):
         self._screen = screen
 
-    def step(self, index: int, total: int, text: str) -> None:
-        """Show that a step begins."""
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
+        """Show that a step begins, and how long all that is left takes, as far as the plan tells."""
         with contextlib.suppress(OSError, ValueError):
-            self._screen.step(index, total, text)
+            self._screen.step(index, total, text, left_s)
 
     def note(self, text: str) -> None:
         """Show a line of text."""
@@ -260,9 +260,9 @@ class Run:
 
     # ------------------------------------------------------------------ reporter of the session
 
-    def step(self, index: int, total: int, text: str) -> None:
-        """Show that a step begins."""
-        self._screen.step(index, total, text)
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
+        """Show that a step begins, and how long all that is left takes, as far as the plan tells."""
+        self._screen.step(index, total, text, left_s)
         self._feed.connected({s: self._group.kind(s).name for s in self._group.serials}, self._clock())
         self._feed.step(self._clock(), f"{index} of {total}: {text}")
 

@@ -19,24 +19,22 @@ from coordinator.live_robot.messenger import Clock, Messenger, Refused, gather_a
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event, since_joined
 from coordinator.recording.recording import Recording
-from coordinator.session.motion_selection import MotionChoice
+from coordinator.session.expected_times import ExpectedTimes
+from coordinator.session.motion_selection import TRIAL_RAD, MotionChoice, resting
 from coordinator.topology.next_motion import MAX_REPEATS, NextMotion
 from coordinator.viewer.feed import Screen
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.errors import RobotError
-from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
+from module_agent.wire.messages import GoTo, MotionRecord, Pattern
 
 DISCOVERY_POLL_S = 0.05
 # Estimates take some tens of milliseconds; one that has not come by then was lost, and is requested.
 ESTIMATE_WAIT_S = 0.6
 # A poor network interrupts more than one motion in ten: factor on the plan's retries.
 POOR_RETRIES = 4
-# How far a slow trial moves every joint to either side, and the share of the way that it has to come along:
-# held joints give under gravity, an X5-4 that holds a whole arm by a third of the way.
-TRIAL_RAD = 0.08
+# The share of the way that a joint has to come along with a slow trial: held joints give under gravity, an
+# X5-4 that holds a whole arm by a third of the way.
 MIN_MOVED_SHARE = 0.5
-# Rest of a run that moves all joints at once, for speed: 1 s determines the gyros' biases to 0.1 mrad/s.
-SIMULTANEOUS_REST_S = 1.0
 
 
 class Reporter(Screen, Protocol):
@@ -106,6 +104,8 @@ class Session:
         self._done = {e.step: e for e in since_joined(recording.journal) if e.what == "done"}
         self._index = 0
         self._total = 4
+        # None before the modules are known.
+        self._times: ExpectedTimes | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._excluded = ExcludedModules(group, self._note_exclusion)
         # Modules that were there so far, and where the joints of those that take part stood.
@@ -129,6 +129,7 @@ class Session:
         self._total = 2 + self._steps()
         self._invalidate_steps_before_boot()
         self._starts = {s: self._position(s) for s in self.group.serials}
+        self._times = self._expected()
         try:
             # The keep-alives first: a lease must not expire while the next module is slow to answer.
             self._keeper = asyncio.create_task(self.group.keep_alive())
@@ -157,6 +158,11 @@ class Session:
             + (self._excitations(joints) if self._plan.dynamics else 0)
         )
 
+    def _expected(self) -> ExpectedTimes:
+        away_rad = max(abs(self._position(s) - self._plan.home_rad) for s in self.group.serials)
+        kinds = {s: self.group.kind(s) for s in self.group.serials}
+        return ExpectedTimes(self._plan, kinds, away_rad, self._done)
+
     async def _measure(self) -> None:
         """Run all motions that show what the robot is.
 
@@ -172,6 +178,8 @@ class Session:
             await self._step("explore", "exploring all joints at once", self._explore_all)
             single = await self._single_joints() if self._single_joints is not None else ()
             self._total += len(single)
+            if self._times is not None:
+                self._times.explore(single)
             await self._explore_each(single)
         else:
             await self._explore_each(self.group.serials)
@@ -210,6 +218,7 @@ class Session:
         self._starts |= {serial: self._position(serial) for serial in joined.serials}
         await gather_all(self._arm_one(serial) for serial in joined.serials)
         self._total = self._index + self._steps()
+        self._times = self._expected()
 
     async def _discover(self, expect: int | None) -> None:
         self._report("discovering modules")
@@ -264,6 +273,8 @@ class Session:
         self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
     ) -> None:
         self._report(text)
+        if self._times is not None:
+            self._times.over(name)
         if name in self._done:
             return
         self._journal(JournalEvent(t_ns=self._clock(), what="begin", step=name))
@@ -363,9 +374,7 @@ class Session:
             await self._go({serial: home}, speed_rad_s)
 
     async def _rest(self) -> None:
-        longest_s = SIMULTANEOUS_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
-        pattern = Rest(duration_s=min(longest_s, self._plan.rest_s))
-        records = await self.group.run(dict.fromkeys(self._excluded.movers(), pattern))
+        records = await self.group.run(dict.fromkeys(self._excluded.movers(), resting(self._plan)))
         for serial, record in records.items():
             self._note_motion("rest", serial, record, "rest")
 
@@ -455,6 +464,8 @@ class Session:
         motions = await self._reporter.excitation() if self._excites_together() else ()
         serials = self._excluded.movers() if not motions else ()
         self._total += (len(motions) or 2 * len(serials)) - self._excitations(len(self.group.serials))
+        if self._times is not None:
+            self._times.excite(motions, serials)
         for number, motion in enumerate(motions):
             last = number == len(motions) - 1
             purpose: Purpose = "held_out" if last else "dynamic"
@@ -530,4 +541,4 @@ class Session:
 
     def _report(self, text: str) -> None:
         self._index += 1
-        self._reporter.step(self._index, self._total, text)
+        self._reporter.step(self._index, self._total, text, self._times.left_s if self._times else None)

@@ -45,8 +45,8 @@ OWN_DISTANCE = "own_distance"
 class Screen(Protocol):
     """Shows the progress of a run; the terminal implements it."""
 
-    def step(self, index: int, total: int, text: str) -> None:
-        """Show that a step begins."""
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
+        """Show that a step begins, and how long all that is left takes, as far as the plan tells."""
         ...
 
     def note(self, text: str) -> None:

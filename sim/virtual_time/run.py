@@ -64,7 +64,7 @@ class VirtualConfig(NamedTuple):
 class SilentScreen:
     """A screen that shows nothing."""
 
-    def step(self, index: int, total: int, text: str) -> None:
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
         """Ignore the beginning of a step."""
 
     def note(self, text: str) -> None:

@@ -54,7 +54,7 @@ class Ears:
     def report(self, update: MonitorUpdate) -> None:
         self.noted += update.notes
 
-    def step(self, index: int, total: int, text: str) -> None:
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
         self.noted.append(f"[{index}/{total}] {text}")
 
     def note(self, text: str) -> None:

@@ -45,7 +45,7 @@ class Silent:
     def __init__(self) -> None:
         self.notes: list[str] = []
 
-    def step(self, index: int, total: int, text: str) -> None:
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
         pass
 
     def note(self, text: str) -> None:

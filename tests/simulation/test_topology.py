@@ -59,7 +59,7 @@ class Watcher:
         self.notes: list[str] = []
         self._on_step = on_step
 
-    def step(self, index: int, total: int, text: str) -> None:
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
         assert index <= total
         self._on_step(text)
 

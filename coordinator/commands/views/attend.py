@@ -25,7 +25,7 @@ class AttendScreen(Displayed):
         self._print(text, t_ns)
         self._lines.write({"t_ns": t_ns, "says": text})
 
-    def step(self, index: int, total: int, text: str) -> None:
+    def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
         """Show that a step of a measurement begins."""
         self.note(f"[{index}/{total}] {text}")
 

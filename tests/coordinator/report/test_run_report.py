@@ -233,7 +233,7 @@ def interrupted(out: Path, lines: list[str]) -> None:
     """Run a robot in virtual time that is interrupted while it moves."""
 
     class Screen:
-        def step(self, index: int, total: int, text: str) -> None: ...
+        def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None: ...
 
         def note(self, text: str) -> None:
             lines.append(text)
