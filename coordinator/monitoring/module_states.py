@@ -1,19 +1,15 @@
 """What every module of a robot does now, as a table shows it: from its messages alone, without a model.
 
-Rates and delays are of the last ten seconds. A row's delay is from its sample, by the module's clock mapped
-to the session's, to the arrival of the message in which it is the newest one, so that the wait for a batch to
-fill is not in it.
+Rates and delays (`synchronisation.feedback_delays`) are of the last ten seconds.
 """
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from coordinator.recording.recording import Entry, ModuleRecord, Recording, RoundTrip
-from module_agent.model.chain import Array
+from coordinator.recording.recording import Entry, ModuleRecord, Recording
+from coordinator.synchronisation.feedback_delays import FeedbackDelay, recent_delay
 from module_agent.wire.messages import Feedback, Info, Message
 
 WINDOW_NS = 10_000_000_000
@@ -27,7 +23,7 @@ class ModuleState(NamedTuple):
     """A module at one time; None where it is not known.
 
     name: family and name as its user gave them, empty without. state: as the module says, or `silent`, or
-    `gone` without its liveliness token. rows_per_s, delay_p50_ms, delay_p99_ms: of the last ten seconds.
+    `gone` without its liveliness token. rows_per_s, delay: of the last ten seconds.
     lost_rows: since the module was heard first. refused: by reason.
     """
 
@@ -43,8 +39,7 @@ class ModuleState(NamedTuple):
     voltage_v: float | None = None
     rows_per_s: float = 0.0
     lost_rows: int = 0
-    delay_p50_ms: float | None = None
-    delay_p99_ms: float | None = None
+    delay: FeedbackDelay | None = None
     refused: Mapping[str, int] = MappingProxyType({})
 
 
@@ -54,11 +49,10 @@ def full_name(info: Info | None) -> str:
 
 
 class _Delivery(NamedTuple):
-    """A feedback message: first row, number of rows, newest row's module time, session time of arrival."""
+    """A feedback message: first row, number of rows, session time of arrival."""
 
     first_row: int
     rows: int
-    row_ns: int
     arrival_ns: int
 
 
@@ -106,12 +100,10 @@ class ModuleStates:
         message = self.recording.accept(entry)
         if isinstance(message, Feedback) and entry.kind == "publication" and message.count:
             module = self.recording.module(message.serial, message.boot)
-            newest = module.rows.rows(message.first_row, message.first_row + message.count)["t_ns"][-1:]
             known = self._deliveries.get(message.serial)
             if known is None or known.boot != message.boot:
                 known = self._deliveries[message.serial] = _Deliveries(message.boot, message.first_row)
-            for row_ns in newest.tolist():
-                known.add(_Delivery(message.first_row, message.count, row_ns, entry.t_ns))
+            known.add(_Delivery(message.first_row, message.count, entry.t_ns))
             if module.rows.end_row - module.rows.first_row > 2 * KEPT_ROWS:
                 module.forget(KEPT_ROWS, KEPT_TRIPS)
         return message
@@ -151,7 +143,7 @@ _SHOWN = ("position_rad", "velocity_rad_s", "effort_nm", "winding_temperature_c"
 
 
 def _figures(module: ModuleRecord, known: _Deliveries, now_ns: int) -> dict[str, Any]:
-    """Return the rate of rows, and percentiles of their delay as far as the clock is known."""
+    """Return the rate of rows, and their delay as far as the clock is known."""
     known.drop_before(now_ns - WINDOW_NS)
     if not known.latest:
         return {}
@@ -161,27 +153,4 @@ def _figures(module: ModuleRecord, known: _Deliveries, now_ns: int) -> dict[str,
     figures: dict[str, Any] = {}
     if span_ns > 0:
         figures["rows_per_s"] = 1e9 * sum(one.rows for one in later) / span_ns
-    delay_ms = _delays_ms(module.round_trips, known.latest)
-    if len(delay_ms):
-        p50, p99 = (float(value) for value in np.percentile(delay_ms, (50, 99)))
-        figures |= {"delay_p50_ms": p50, "delay_p99_ms": p99}
-    return figures
-
-
-def _delays_ms(trips: Sequence[RoundTrip], deliveries: Iterable[_Delivery]) -> Array:
-    """Return the delays of deliveries between the first and the last of the round trips.
-
-    The clock is interpolated between the middles of successive trips, by each of which it is off by at most
-    half the trip: one line through all of them would be wrong by much more where a simulated world falls
-    behind its machine, and stretches the modules' clocks unevenly.
-    """
-    if len(trips) < 2:
-        return np.zeros(0)
-    sent_ns, received_ns, module_ns = np.array(sorted(trips, key=lambda trip: trip.module_ns), np.int64).T
-    row_ns, arrival_ns = np.array([(one.row_ns, one.arrival_ns) for one in deliveries], np.int64).T
-    within = (row_ns >= module_ns[0]) & (row_ns <= module_ns[-1])
-    # Relative times, since a float does not resolve years to the nanosecond.
-    zero_ns, begin_ns = module_ns[0], sent_ns[0]
-    middle = 0.5 * ((sent_ns - begin_ns) + (received_ns - begin_ns))
-    sampled = np.interp((row_ns[within] - zero_ns).astype(float), (module_ns - zero_ns).astype(float), middle)
-    return np.asarray(1e-6 * ((arrival_ns[within] - begin_ns) - sampled))
+    return figures | {"delay": recent_delay(module, now_ns - WINDOW_NS)}

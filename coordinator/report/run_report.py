@@ -33,7 +33,7 @@ from coordinator.report.plots import (
     time_line_plot,
 )
 from coordinator.report.result_sections import HALF_95, HeldOutTorques, result_sections, sure_topology
-from coordinator.synchronisation.feedback_delays import feedback_delays
+from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import DataError, UsageError
 
@@ -298,8 +298,8 @@ def _network(recording: Recording) -> Section:
                 float(np.percentile(ms, 95)),
                 log.end_row - log.first_row,
                 lost,
-                delay.p50_ms if delay is not None else None,
-                delay.p99_ms if delay is not None else None,
+                _delay_cell(delay, delay.p50_ms) if delay is not None else None,
+                _delay_cell(delay, delay.p99_ms) if delay is not None else None,
                 _NS * clock.offset_ns if clock is not None else None,
                 1e-6 * HALF_95 * clock.sigma_ns if clock is not None else None,
                 1e6 * clock.drift if clock is not None else None,
@@ -312,8 +312,10 @@ def _network(recording: Recording) -> Section:
         Column(name="95th percentile", unit="ms", form=".2f", group="round trips"),
         Column(name="published", form=".0f", group="feedback rows"),
         Column(name="missing", form=".0f", group="feedback rows"),
-        Column(name="median", unit="ms", form=".2f", group="feedback, sample to coordinator"),
-        Column(name="99th percentile", unit="ms", form=".2f", group="feedback, sample to coordinator"),
+        Column(name="median", unit="ms", form=".2f", group="feedback, sample to coordinator", right=True),
+        Column(
+            name="99th percentile", unit="ms", form=".2f", group="feedback, sample to coordinator", right=True
+        ),
         Column(name="offset", unit="s", form=".6f", group="clock against the session"),
         Column(name="± 95 %", unit="ms", form=".3f", group="clock against the session"),
         Column(name="drift", unit="ppm", form=".1f", group="clock against the session"),
@@ -336,6 +338,11 @@ def _network(recording: Recording) -> Section:
     unreadable = f" Unreadable messages: {refused}." if refused else ""
     blocks.append(Paragraph(text=missing + cost + unreadable))
     return Section(title="Network and clocks", blocks=tuple(blocks))
+
+
+def _delay_cell(delay: FeedbackDelay, delay_ms: float) -> float | str:
+    """Return a delay [ms] as a cell, in words where the clock does not tell it from none."""
+    return delay_ms if delay_ms >= delay.clock_sigma_ms else delay.shown(delay_ms)
 
 
 def _duration_s(recording: Recording) -> float:

@@ -78,16 +78,21 @@ class ModuleScreen(Displayed):
 
 
 def fields(state: ModuleState) -> dict[str, object]:
-    """Return a state for programs; SI units in the names."""
-    return {**state._asdict(), "refused": dict(state.refused)}
+    """Return a state for programs; units in the names."""
+    plain, delay = state._asdict(), state.delay
+    del plain["delay"]
+    known = ("p50_ms", "p99_ms", "clock_sigma_ms")
+    delays = {f"delay_{name}": None if delay is None else getattr(delay, name) for name in known}
+    return {**plain, **delays, "refused": dict(state.refused)}
 
 
 def line(state: ModuleState) -> str:
     """Return a state in one line."""
+    p50, p99 = _delays(state)
     return (
-        f"{state.serial} {state.state}: {_angle(state.position_rad, '.2f')} deg, "
-        f"{figure(state.effort_nm, '.2f')} Nm, {state.rows_per_s:.0f} rows/s, {state.lost_rows} lost, "
-        f"delay {figure(state.delay_p50_ms, '.1f')} ms, p99 {figure(state.delay_p99_ms, '.1f')} ms"
+        f"{state.serial} {state.state}: {_angle(state.position_rad, 'z.2f')} deg, "
+        f"{figure(state.effort_nm, 'z.2f')} Nm, {state.rows_per_s:.0f} rows/s, {state.lost_rows} lost, "
+        f"delay {p50} ms, p99 {p99} ms"
     )
 
 
@@ -102,18 +107,22 @@ def table(robot: str, states: Sequence[ModuleState]) -> Table:
             state.kind or "-",
             Text(state.state, style=_STYLES.get(state.state, "")),
             _short(state.holder),
-            _angle(state.position_rad, ".2f"),
-            _angle(state.velocity_rad_s, ".1f"),
-            figure(state.effort_nm, ".2f"),
+            _angle(state.position_rad, "z.2f"),
+            _angle(state.velocity_rad_s, "z.1f"),
+            figure(state.effort_nm, "z.2f"),
             figure(state.winding_temperature_c, ".1f"),
             figure(state.voltage_v, ".1f"),
             f"{state.rows_per_s:.0f}",
             Text(str(state.lost_rows), style="red" if state.lost_rows else ""),
-            figure(state.delay_p50_ms, ".1f"),
-            figure(state.delay_p99_ms, ".1f"),
+            *_delays(state),
             ", ".join(f"{reason} {count}" for reason, count in state.refused.items()) or "-",
         )
     return shown
+
+
+def _delays(state: ModuleState) -> tuple[str, str]:
+    delay = state.delay
+    return ("-", "-") if delay is None else (delay.shown(delay.p50_ms), delay.shown(delay.p99_ms))
 
 
 def _angle(value_rad: float | None, form: str) -> str:

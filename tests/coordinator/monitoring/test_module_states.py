@@ -22,6 +22,7 @@ from coordinator.main import app
 from coordinator.monitoring.live_states import LiveStates
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from coordinator.runtime.key_presses import key_presses
+from coordinator.synchronisation.feedback_delays import FeedbackDelay
 from module_agent.wire.keys import Leaf
 
 # Module clock behind the session's: 40 days of uptime.
@@ -70,8 +71,11 @@ def test_rows_a_second_and_delays_are_those_of_the_messages(wire: SimpleNamespac
     assert (state.serial, state.kind, state.state, state.holder) == ("A", "X5-4", "armed", "me@here")
     assert state.rows_per_s == pytest.approx(250.0, rel=1e-3)
     assert state.lost_rows == 0
-    assert state.delay_p50_ms == pytest.approx(3.0, abs=1e-3)
-    assert state.delay_p99_ms == pytest.approx(3.0, abs=1e-3)
+    assert state.delay is not None
+    assert state.delay.p50_ms == pytest.approx(3.0, abs=1e-3)
+    assert state.delay.p99_ms == pytest.approx(3.0, abs=1e-3)
+    # A round trip of 0.6 ms may have been answered at any of its moments.
+    assert state.delay.clock_sigma_ms == pytest.approx(0.6 / 12**0.5, abs=1e-3)
     assert state.refused == {"no_lease": 2}
     # The position of a row is its number.
     assert state.position_rad == pytest.approx(20.0 * 250 - 1)
@@ -83,7 +87,8 @@ def test_a_world_that_falls_behind_its_machine_does_not_make_feedback_arrive_bef
     states = ModuleStates()
     (state,) = states.at(feed(states, wire, 12.0, slow=0.2), {"A"})
     # 3 ms between two round trips that are half a second apart, across a change of 20 % in the clock's rate.
-    assert state.delay_p50_ms == pytest.approx(3.0, abs=0.2)
+    assert state.delay is not None
+    assert state.delay.p50_ms == pytest.approx(3.0, abs=0.2)
 
 
 def test_lost_rows_count_and_repeated_ones_do_not(wire: SimpleNamespace) -> None:
@@ -172,8 +177,8 @@ def test_every_module_of_a_robot_is_shown_with_its_figures(follower: Follower) -
         assert state.voltage_v == pytest.approx(24.0, abs=2.0)
         assert state.rows_per_s == pytest.approx(250.0, rel=0.05)
         # A cable's delay is a fraction of a millisecond, and a clock is known to half a round trip.
-        assert state.delay_p50_ms is not None
-        assert -0.5 < state.delay_p50_ms < 5.0
+        assert state.delay is not None
+        assert -0.5 < state.delay.p50_ms < 5.0
 
 
 def test_a_key_holds_all_modules_and_the_same_key_releases_them(follower: Follower) -> None:
@@ -254,8 +259,7 @@ def example() -> list[ModuleState]:
         23.9,
         250.0,
         12,
-        1.5,
-        4.0,
+        FeedbackDelay("elbow", 500, -0.2, 4.0, 4.5, 0.3),
     )
     return [moving, ModuleState("wrist", "", None, "silent", None, refused={"no_lease": 3})]
 
@@ -276,6 +280,9 @@ def test_the_table_has_every_figure_with_its_unit() -> None:
         "no_lease 3",
         "[deg]",
         "[Nm]",
+        # What is known of a delay of -0.2 +- 0.3 ms.
+        "< 0.3",
+        "4.0",
     ):
         assert words in shown
     assert "host-1f" not in shown

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coordinator.recording.recording import Recording
-from coordinator.synchronisation.feedback_delays import feedback_delays
+from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays, recent_delay
 from module_agent.wire.keys import Leaf
 
 OFFSET_NS, DRIFT = 7_000_000_000, 40e-6
@@ -61,3 +61,22 @@ def test_rows_that_are_asked_for_again_and_copies_of_messages_are_no_late_feedba
 
 def test_without_a_round_trip_no_delay_is_claimed(wire: SimpleNamespace) -> None:
     assert list(feedback_delays(recorded(wire, np.full(50, 1.0), trips=0))) == []
+
+
+def test_the_latest_delays_are_those_of_the_messages_since_then(wire: SimpleNamespace) -> None:
+    # A minute of 1 ms, then ten seconds of 5 ms.
+    recording = recorded(wire, np.concatenate([np.full(3000, 1.0), np.full(500, 5.0)]))
+    found = recent_delay(recording.modules["A"], 60_000_000_000)
+    assert found is not None
+    # Its arrival at 60.001 s is of the message before the change, if at all.
+    assert found.messages == pytest.approx(500, abs=1)
+    assert found.p50_ms == pytest.approx(5.0, abs=0.01)
+    assert found.clock_sigma_ms == pytest.approx(0.4 / np.sqrt(3.0), rel=0.05)
+    assert recent_delay(recording.modules["A"], 80_000_000_000) is None
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "shown"), [(-0.21, "< 0.3"), (0.29, "< 0.3"), (0.31, "0.3"), (12.34, "12.3")]
+)
+def test_no_delay_is_shown_that_the_clock_does_not_tell_from_none(delay_ms: float, shown: str) -> None:
+    assert FeedbackDelay("A", 9, delay_ms, delay_ms, delay_ms, 0.3).shown(delay_ms) == shown
