@@ -1,5 +1,8 @@
 """A run as an MCAP file of JSON messages with Foxglove's schemas, and ours where it has none.
 
+Names and fields are those that Foxglove publishes (foxglove/foxglove-sdk, schemas/jsonschema), by which its
+panels recognise messages.
+
 | topic | schema | content |
 |---|---|---|
 | `/robot_description` | foxglove.RobotDescription | the URDF, once |
@@ -39,7 +42,8 @@ def _list(items: _Schema) -> _Schema:
     return {"type": "array", "items": items}
 
 
-_TIME = _object("time", sec={"type": "integer", "minimum": 0}, nsec={"type": "integer", "minimum": 0})
+_NANOSECONDS: _Schema = {"type": "integer", "minimum": 0, "maximum": 999_999_999}
+_TIME = _object("time", sec={"type": "integer", "minimum": 0}, nsec=_NANOSECONDS)
 _VECTOR = _object("foxglove.Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION = _object("foxglove.Quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 _SCHEMAS = {
