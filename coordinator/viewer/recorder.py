@@ -1,6 +1,7 @@
 """What the logging thread does: keep the state of what is shown, and write it to one stream."""
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import rerun as rr
 
 from coordinator.viewer.scene import blueprint, entity_paths, robot_geometry, robot_scene, time_series
 from coordinator.viewer.scene import topology_graph as graphs
-from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS, Estimate, with_estimate
+from coordinator.viewer.scene.parameter_plot import EDGE_MARGIN, NINETY_FIVE_SIGMAS, Estimate, with_estimate
 from coordinator.viewer.scene.time_series import Batch, IntArray
 from module_agent.model.chain import Array, Chain
 from module_agent.wire.feedback_rows import Rows
@@ -17,6 +18,8 @@ from module_agent.wire.feedback_rows import Rows
 LEGEND = "Band: 1σ. Thin lines and ellipsoids: 95 %. Grey: the truth, if known."
 # The camera is set for a robot larger than this by as much, and moved when the robot has outgrown that.
 ROOM = 1.25
+# Of the postures that the camera is to show, one a second is kept, and those of the last ten minutes.
+POSTURE_NS, POSTURES = 1_000_000_000, 600
 STYLES = {style.world: style for style in (robot_scene.ESTIMATE_STYLE, robot_scene.TRUTH_STYLE)}
 
 
@@ -58,6 +61,9 @@ class Recorder:
         self._states = time_series.StateChanges()
         self._scenes: dict[str, robot_scene.Scene] = {}
         self._q_rad: dict[str, float] = {}
+        self._stood: deque[tuple[int, dict[str, float]]] = deque(maxlen=POSTURES)
+        self._drawn: Chain | None = None
+        self._turned_rad: list[float] = []
         self._estimates: dict[tuple[str, str], Estimate] = {}
         self._truths: dict[tuple[str, str], float] = {}
         self._rows: dict[str, list[Batch]] = {}
@@ -73,6 +79,8 @@ class Recorder:
         """Log `rows` (m,), taken at `t_ns` (m,)."""
         self._register([serial])
         if t_ns.size:
+            q_rad = [*self._turned_rad, *rows["position_rad"].tolist()]
+            self._turned_rad = [min(q_rad), max(q_rad)]
             gathered = self._rows.setdefault(serial, [])
             gathered.append(Batch(serial, t_ns, rows))
             if t_ns.max() - gathered[0].t_ns.min() >= self._pace.period_ns:
@@ -93,6 +101,14 @@ class Recorder:
         for serial in tuple(self._rows):
             self._log_rows(serial)
         self._log_poses()
+        if not self._pace.layout_follows:
+            # All is known that there is to see; a live viewer's camera is left where its user has it.
+            if self._drawn is not None:
+                self._contents = self._contents._replace(ball=self._ball(self._drawn))
+            if self._turned_rad:
+                low, high = self._turned_rad
+                edge = EDGE_MARGIN * max(high - low, 0.1)
+                self._contents = self._contents._replace(position_rad=(low - edge, high + edge))
         self._show()
 
     def phase(self, t_ns: int, text: str) -> None:
@@ -218,6 +234,9 @@ class Recorder:
             return
         t_ns, q_rad = (np.concatenate(column) for column in zip(*self._poses, strict=True))
         self._poses.clear()
+        for t, q in zip(t_ns.tolist(), q_rad, strict=True):
+            if not self._stood or t - self._stood[-1][0] >= POSTURE_NS:
+                self._stood.append((t, dict(zip(self._posed, q.tolist(), strict=True))))
         self._q_rad.update(zip(self._posed, q_rad[-1].tolist(), strict=True))
         for scene in self._scenes.values():
             postures = np.tile(self._posture(scene.chain), (t_ns.size, 1))
@@ -254,14 +273,19 @@ class Recorder:
         self._show()
 
     def _frame(self, chain: Chain) -> None:
-        placed = robot_geometry.modules(chain, self._types)
-        ball = robot_geometry.ball_around(chain, placed, self._posture(chain))
+        self._drawn, ball = chain, self._ball(chain)
         self._stream.log(entity_paths.GRAVITY, robot_scene.gravity_arrow(chain, ball.radius_m))
         # The camera belongs to the user, unless the robot has outgrown the view.
         known = self._contents.ball
         if known is None or not known._replace(radius_m=ROOM * known.radius_m).holds(ball):
             self._contents = self._contents._replace(ball=ball)
             self.show_if_new()
+
+    def _ball(self, chain: Chain) -> robot_geometry.Ball:
+        """Return the ball around a robot in all postures that it was seen in, and as it is now."""
+        stood = [*(q_rad for _, q_rad in self._stood), self._q_rad]
+        postures = np.array([[q_rad.get(serial, 0.0) for serial in chain.serials] for q_rad in stood])
+        return robot_geometry.ball_around(chain, robot_geometry.modules(chain, self._types), postures)
 
     def _posture(self, chain: Chain) -> Array:
         return np.array([self._q_rad.get(serial, 0.0) for serial in chain.serials])

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 import rerun_bindings as bindings
 
 from coordinator.viewer.scene import entity_paths
-from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter
+from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter, Range, labelled
 from coordinator.viewer.scene.robot_geometry import Ball
 from coordinator.viewer.scene.topology_graph import Topology, extent
 
@@ -35,7 +35,10 @@ _WHOLE_RUN = rr.TimeRange(
 
 
 class Contents(NamedTuple):
-    """Everything that the layout depends on."""
+    """Everything that the layout depends on.
+
+    ball: around the robot. position_rad: the range of all joints; None leaves it to the viewer.
+    """
 
     robot: str
     serials: tuple[str, ...] = ()
@@ -43,6 +46,7 @@ class Contents(NamedTuple):
     topology: Topology | None = None
     ball: Ball | None = None
     truth: bool = False
+    position_rad: Range | None = None
 
 
 def views(contents: Contents) -> Contents:
@@ -89,7 +93,11 @@ def _left(contents: Contents) -> rrb.Vertical:
         rrb.TextDocumentView(origin=entity_paths.PHASE_NOW, name="Step"),
         _robot(contents),
         _of_modules(
-            "Joint position [rad]", contents.serials, entity_paths.module_path, entity_paths.POSITION
+            "Joint position [rad]",
+            contents.serials,
+            entity_paths.module_path,
+            entity_paths.POSITION,
+            contents.position_rad,
         ),
         row_shares=[1.2, 6, 4],
     )
@@ -163,7 +171,7 @@ def _estimate(parameter: Parameter, serial: str) -> rrb.View:
         name=f"{serial} {parameter.title()} [{parameter.units}]",
         # One time axis for all, so that the effect of a motion on each of them is visible.
         axis_x=rrb.TimeAxis(view_range=_WHOLE_RUN),
-        axis_y=None if axis_range is None else rrb.ScalarAxis(range=axis_range),
+        axis_y=None if axis_range is None else rrb.ScalarAxis(range=labelled(axis_range)),
         plot_legend=rrb.PlotLegend(visible=False),
     )
 
@@ -259,13 +267,18 @@ def _network(contents: Contents) -> rrb.Vertical:
 
 
 def _of_modules(
-    name: str, serials: Sequence[str], path: Callable[[str, str], str], group: str
+    name: str,
+    serials: Sequence[str],
+    path: Callable[[str, str], str],
+    group: str,
+    axis_range: Range | None = None,
 ) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
         contents=[path(serial, group) for serial in serials],
         name=name,
         axis_x=rrb.TimeAxis(view_range=_WHOLE_RUN),
+        axis_y=None if axis_range is None else rrb.ScalarAxis(range=labelled(axis_range)),
     )
 
 

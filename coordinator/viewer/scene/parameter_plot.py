@@ -14,6 +14,8 @@ ZOOMED_SIGMAS = 8.0
 AGREEING_SIGMAS = 4.0
 # Half width of the 95 % interval of a normal distribution.
 NINETY_FIVE_SIGMAS = 1.96
+# The viewer labels powers of ten, if they are at least this share of a plot apart.
+LABELLED_SHARE = 1.0 / 7.0
 # Distance of a further value, such as the truth, from the edge of a plot, as a fraction of its height.
 EDGE_MARGIN = 0.06
 
@@ -74,6 +76,21 @@ def including(around: Range | None, value: float | None) -> Range | None:
     low, high = around
     edge = EDGE_MARGIN * (max(high, value) - min(low, value))
     return (low if value > low else value - edge, high if value < high else value + edge)
+
+
+def labelled(shown: Range) -> Range:
+    """Return a range in which the viewer labels two places at least: one number alone gives no scale."""
+    low, high = shown
+    step = 10.0 ** math.ceil(math.log10(max(LABELLED_SHARE * (high - low), 1e-12)))
+    first, last = math.ceil(low / step), math.floor(high / step)
+    while last - first < 1:
+        if (last + 1) * step - high <= low - (first - 1) * step:
+            last += 1
+            high = (last + EDGE_MARGIN) * step
+        else:
+            first -= 1
+            low = (first - EDGE_MARGIN) * step
+    return low, high
 
 
 def with_estimate(

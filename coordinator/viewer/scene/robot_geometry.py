@@ -63,17 +63,19 @@ class Ball(NamedTuple):
 
 
 def ball_around(chain: Chain, placed: Sequence[Module], q_rad: Array) -> Ball:
-    """Return the ball around housings and outputs in a posture (n,), about the middle of their box."""
-    moved = np.concatenate([body_displacements(chain, q_rad[None, :])[0], np.eye(4)[None]])
+    """Return the ball around housings and outputs in postures (k, n), about the middle of their box."""
+    moved = body_displacements(chain, q_rad)
+    fixed = np.broadcast_to(np.eye(4), (len(q_rad), 1, 4, 4))
+    moved = np.concatenate([moved, fixed], axis=1)
     corners = [
-        moved[body, :3, :3] @ place + moved[body, :3, 3]
+        moved[:, body, :3, :3] @ place + moved[:, body, :3, 3]
         for module in placed
         for body, place in (
             (module.housing_body, module.housing[:3, 3]),
             (module.output_body, module.output),
         )
     ]
-    upright_corners = upright(chain.gravity).apply(np.array([*corners, np.zeros(3)]))
+    upright_corners = upright(chain.gravity).apply(np.vstack([*corners, np.zeros(3)]))
     centre = 0.5 * (upright_corners.min(axis=0) + upright_corners.max(axis=0))
     x, y, z = centre.tolist()
     return Ball((x, y, z), float(np.linalg.norm(upright_corners - centre, axis=1).max()))

@@ -12,13 +12,17 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from coordinator.viewer.recorder import FILE, LIVE, Pace, Recorder
+from coordinator.viewer.scene.entity_paths import ESTIMATED_WORLD
 from coordinator.viewer.scene.parameter_plot import Estimate
+from coordinator.viewer.scene.robot_geometry import ball_around, modules
 from coordinator.viewer.scene.time_series import INTERVAL_NS
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import imu_poses
 from module_agent.wire.feedback_rows import Rows
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
 
 Read = Callable[[Path, str], pd.DataFrame]
 MakeRows = Callable[[int, int], Rows]
@@ -210,6 +214,27 @@ def test_the_bodies_turn_so_that_the_imus_are_where_the_kinematics_says(
     # Single precision in the recording: 1e-6 of lengths of a metre.
     np.testing.assert_allclose(moved @ imu, imu_poses(arm, q[None, :])[0, 1], atol=1e-6)
     assert times_ns(table) == [10, 20]
+
+
+def test_a_file_opens_on_all_postures_that_the_robot_was_in() -> None:
+    robot = load_robot("a2085_04")
+    chain, types = true_chain(robot), {module.serial: module.type for module in robot.modules}
+    stream = rr.RecordingStream("x5")
+    stream.memory_recording()
+    recorder = Recorder(stream, "arm", FILE)
+    recorder.modules(chain.serials, types)
+    # It turns about the vertical by a quarter to either side, and ends where it began.
+    turned = np.zeros((3, len(chain.serials)))
+    turned[:, 0] = 1.57, -1.57, 0.0
+    recorder.chain(0, chain, None, ESTIMATED_WORLD)
+    recorder.poses(np.array([1, 2, 3]) * 1_500_000_000, turned, chain.serials)
+    recorder.finish()
+    ball, placed = recorder._contents.ball, modules(chain, types)
+    assert ball is not None
+    alone = [ball_around(chain, placed, q[None]) for q in turned]
+    assert all(ball.holds(one._replace(radius_m=0.0)) for one in alone)
+    # An arm of 0.7 m to both sides.
+    assert ball.radius_m > 1.5 * max(one.radius_m for one in alone)
 
 
 def test_poses_that_come_together_are_logged_each_at_its_time(

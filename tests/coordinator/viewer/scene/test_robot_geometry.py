@@ -80,14 +80,17 @@ def _arm() -> tuple[Chain, dict[str, str]]:
 
 
 @settings(deadline=None)
-@given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
-def test_the_camera_is_set_for_a_ball_that_holds_all_modules(q0: float, q1: float) -> None:
+@given(st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)), min_size=1, max_size=4))
+def test_the_camera_is_set_for_a_ball_that_holds_all_modules_in_all_postures(
+    postures: list[tuple[float, float]],
+) -> None:
     arm, types = _arm()
-    q = np.array([q0, q1])
+    q = np.array(postures)
     ball = ball_around(arm, modules(arm, types), q)
-    moved = body_displacements(arm, q[None])[0]
-    for module, motion in zip(modules(arm, types), moved, strict=True):
-        assert np.linalg.norm((motion @ [*module.output, 1.0])[:3] - ball.centre_m) <= ball.radius_m + 1e-9
+    for moved in body_displacements(arm, q):
+        for module, motion in zip(modules(arm, types), moved, strict=True):
+            output = (motion @ [*module.output, 1.0])[:3]
+            assert np.linalg.norm(output - ball.centre_m) <= ball.radius_m + 1e-9
     # And is no larger than the box around them.
     assert ball.radius_m <= 0.5 * np.linalg.norm([0.4, 0.4, 0.5])
     assert ball._replace(radius_m=1.1 * ball.radius_m).holds(ball)

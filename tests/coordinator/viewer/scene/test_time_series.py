@@ -1,11 +1,12 @@
 """Envelopes, states, colours and axis ranges, which are computed before anything is logged."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.viewer.scene.entity_paths import Palette, axis_shades, nth_colour
-from coordinator.viewer.scene.parameter_plot import Estimate, Parameter, fitting, with_estimate
+from coordinator.viewer.scene.parameter_plot import Estimate, Parameter, fitting, labelled, with_estimate
 from coordinator.viewer.scene.time_series import INTERVAL_NS, Batch, StateChanges, envelope
 from module_agent.wire.feedback_rows import ROW
 
@@ -83,6 +84,22 @@ def test_a_converging_estimate_rarely_changes_its_plot() -> None:
         ranges.append(shown)
     # From 0.1 down to 0.0001 by zooms of a factor of about two and more.
     assert 1 < len(dict.fromkeys(ranges)) < 12
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        # A multiple of ten, of one or of a tenth is labelled if a seventh of the plot lies between two.
+        ((179.5, 180.5), (179.5, 181.06)),
+        ((179.4, 180.3), (178.94, 180.3)),
+        ((-0.9, 0.95), (-0.9, 1.06)),
+        ((180.05, 180.95), (179.94, 181.06)),
+        ((41.3, 47.8), (41.3, 47.8)),
+        ((-0.4, 0.3), (-0.4, 0.3)),
+    ],
+)
+def test_two_places_of_a_plot_are_labelled(shown: tuple[float, float], expected: tuple[float, float]) -> None:
+    assert labelled(shown) == pytest.approx(expected)
 
 
 def test_an_estimate_without_a_sigma_leaves_the_range_to_the_viewer() -> None:
