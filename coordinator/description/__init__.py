@@ -1,1 +1,1 @@
-"""Robot descriptions: URDF in and out, HRDF, Denavit-Hartenberg, product of exponentials."""
+"""Robot descriptions: URDF in and out, SRDF, HRDF, Denavit-Hartenberg, product of exponentials."""

@@ -1,4 +1,4 @@
-"""The folder of one run: recording, view, result and the robot as URDF and HRDF."""
+"""The folder of one run: recording, view, result and the robot as URDF, SRDF and HRDF."""
 
 from collections.abc import Iterator
 from contextlib import suppress

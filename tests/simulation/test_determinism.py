@@ -71,5 +71,5 @@ def test_a_replay_of_the_recording_gives_the_same_result(
     rigs(robot, "wifi", 1).session(tmp_path / "run", plan)
     (tmp_path / "replay").mkdir()
     write_outputs(tmp_path / "replay", identify(load_recording(tmp_path / "run" / "session.mcap")))
-    for name in ("result.json", "robot.urdf"):
+    for name in ("result.json", "robot.urdf", "robot.srdf"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "replay" / name).read_bytes()
