@@ -1,6 +1,7 @@
 """One robot in virtual time: world, network, and one agent for every module, on one event loop."""
 
 import asyncio
+import itertools
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
@@ -146,8 +147,10 @@ class VirtualRobot:
         """Return the seeds of endpoints, and boot ids."""
         day = settings.seed if settings.noise_seed is None else (settings.seed, settings.noise_seed)
         endpoints, boots = np.random.SeedSequence(day).spawn(2)
-        ids = np.random.default_rng(boots).integers(1, 2**63, size=len(self.serials))
-        return endpoints, iter(ids.tolist())
+        rng = np.random.default_rng(boots)
+        first = rng.integers(1, 2**63, size=len(self.serials)).tolist()
+        # Those of modules that start again.
+        return endpoints, itertools.chain(first, iter(lambda: int(rng.integers(1, 2**63)), 0))
 
     def endpoint(self, name: str) -> Transport:
         """Return a transport of the virtual network, impaired as the profile says."""

@@ -58,3 +58,20 @@ def test_a_workspace_without_room_keeps_the_model(known_arm: Path, tmp_path: Pat
     assert scene.ears.heard("could not be measured")
     assert [entry.what for entry in scene.versions.history] == ["failed"]
     assert scene.versions.current == scene.versions.folder
+
+
+def test_a_module_that_comes_back_while_the_rest_is_measured_ends_that_by_name(
+    known_arm: Path, tmp_path: Path
+) -> None:
+    scene = Scene(known_arm, tmp_path / "arm", ROOM)
+    scene.at(2.0, lambda: scene.robot.kill(LAST))
+    # The arm that is left moves from 20 s on, within what was checked without this module.
+    scene.at(26.0, lambda: scene.robot.boot(LAST))
+    scene.plays(45.0)
+    (failed_s,) = scene.ears.heard(f"could not be measured, again in 60 s: module {LAST} came in the middle")
+    assert failed_s > 26.0
+    assert scene.ears.heard("all modules are as they are known again")
+    assert [entry.what for entry in scene.versions.history] == ["failed"]
+    assert scene.versions.current == scene.versions.folder
+    states = {serial: host.modules[0].firmware.state for serial, host in scene.robot.hosts.items()}
+    assert set(states.values()) <= {"idle", "stopped"}, states
