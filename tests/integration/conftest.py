@@ -37,6 +37,7 @@ from module_agent.wire.messages import (
 )
 from module_agent.wire.refusal import WireError
 from module_agent.wire.row_log import RowLog
+from sim.physics.engine import Physics
 from sim.processes.launcher import Child, LaunchConfig, Launcher
 from sim.robot.robot_file import load_robot
 
@@ -192,6 +193,7 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
         network: str = "lan",
         lifetime_ms: int = 1000,
         hebi: bool = False,
+        physics: Physics = "pybullet",
     ) -> Launcher:
         config = LaunchConfig(
             robot_file=robot,
@@ -203,6 +205,7 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
             agent_options=("--lifetime-ms", str(lifetime_ms)),
             coordinator_options=("--plan", str(plan), "--no-dynamics", "--no-report"),
             hebi=hebi or THROUGH_THE_DRIVER,
+            physics=physics,
         )
         made.append(Launcher(config, lambda text: None))
         return made[-1]
