@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from module_agent.model.catalogue import ModuleType
+from module_agent.model.read_only import read_only
 from sim.actuator import actuator_kernel as kernel
 from sim.actuator.spring import Springs, build_springs
 from sim.geometry.pose import Array
@@ -62,6 +63,7 @@ class Actuators:
         n = len(types)
         variation = alike(n) if variation is None else variation
         self.springs = build_springs(types, profile, variation.spring)
+        self._built_gap_rad = self.springs.gap_rad
         self._modules = _module_records(types, self.springs, profile, variation)
         self._modules["joint"] = range(n) if skeleton is None else skeleton.module
         self._passives = np.zeros(0 if skeleton is None else len(skeleton.passive), kernel.PASSIVE)
@@ -100,6 +102,13 @@ class Actuators:
         """Multiply the Coulomb and viscous friction of one motor and its gear."""
         self._modules["coulomb_nm"][module] *= factor
         self._modules["viscous_nm_s_rad"][module] *= factor
+
+    def widen_gap(self, module: int, by_rad: float) -> None:
+        """Set the gap of one module's gear to what it was built with and so much more [rad]."""
+        gap_rad = self.springs.gap_rad.copy()
+        gap_rad[module] = self._built_gap_rad[module] + by_rad
+        self.springs = self.springs._replace(gap_rad=read_only(gap_rad))
+        self._modules["half_gap_rad"][module] = gap_rad[module] / 2.0
 
     def step(
         self,

@@ -35,6 +35,8 @@ from sim.imperfections.random_streams import Draws, StandardNormals
 # The share of the largest effort over which the torque's hysteresis is rounded (an assumption). With loops of
 # up to this width the reading still grows with the torque.
 HYSTERESIS_ROUNDING = 0.05
+# Columns of `JointArrays.fixed` that change as a module ages.
+EFFORT_SCALE, EFFORT_OFFSET, HALF_LOOP = 1, 2, 4
 
 # Tick, encoder step, shares of the low-passes of velocity and motor speed, velocity's white noise, jitter.
 _Settings = tuple[float, float, float, float, float, float]

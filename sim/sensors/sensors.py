@@ -9,7 +9,8 @@ from module_agent.hardware.hardware import Readings
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.compiled import compiled, compiled_with
 from sim.geometry.pose import Array
-from sim.imperfections.module_errors import SensorErrors, draw_sensor_errors
+from sim.imperfections.ageing import Ageing
+from sim.imperfections.module_errors import SensorErrors, draw_sensor_errors, per_axis
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.imperfections.random_streams import BLOCK, generator
 from sim.sensors import imu, joint
@@ -93,11 +94,23 @@ class Sensors:
             imu_ticks=imu_ticks,
             every_tick=imus.every_tick,
         )
+        own = self.arrays
+        self._built = own.imu.scale.copy(), own.imu.bias.copy(), own.joint.fixed.copy()
 
     def refill(self) -> None:
         """Draw the noise of the next ticks; kernels need it as soon as they are `used_up`."""
         for stream in self._streams:
             stream.refill()
+
+    def age(self, module: int, ageing: Ageing) -> None:
+        """Set the constants of one module's sensors to those that it was built with, and what was added."""
+        imus, fixed = self.arrays.imu, self.arrays.joint.fixed
+        scale, bias, row = self._built
+        imus.scale[module] = scale[module] + per_axis(ageing.gyro_scale, ageing.accel_scale)
+        imus.bias[module] = bias[module] + per_axis(ageing.gyro_bias_rad_s, ageing.accel_bias_m_s2)
+        fixed[module, joint.EFFORT_SCALE] = row[module, joint.EFFORT_SCALE] + ageing.effort_scale
+        fixed[module, joint.EFFORT_OFFSET] = row[module, joint.EFFORT_OFFSET] + ageing.effort_offset_nm
+        fixed[module, joint.HALF_LOOP] = row[module, joint.HALF_LOOP] + ageing.hysteresis_nm / 2.0
 
     def read(self, tick: int, truth: Instant, readings: Readings) -> None:
         """Write one sample per module into `readings`. To be called once a tick, in order."""

@@ -14,6 +14,7 @@ from module_agent.model.read_only import read_only
 from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators
 from sim.actuator.thermal import Windings
 from sim.geometry.pose import Array
+from sim.imperfections.ageing import Ageing, check_ageing
 from sim.imperfections.module_errors import draw_variation
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.physics.engine import CompiledEngine, Engine, Physics
@@ -215,6 +216,19 @@ class World:
         if not (math.isfinite(factor) and factor >= 0.0):
             raise ValueError(f"friction times {factor} is no friction; a number from 0 on is needed")
         self._actuators.change_friction(self.robot.serials.index(serial), factor)
+
+    def age(self, serial: str, ageing: Ageing) -> None:
+        """Let a module be as it was built but for its ageing, from the next tick on.
+
+        Raises:
+            ValueError: no such module.
+            UsageError: an ageing that no module can have.
+        """
+        if serial not in self.robot.serials:
+            raise ValueError(f"no module {serial} here; there are {', '.join(self.robot.serials)}")
+        place, ageing = self.robot.serials.index(serial), check_ageing(ageing)
+        self._actuators.widen_gap(place, ageing.play_rad)
+        self.sensors.age(place, ageing)
 
     def supply(self, voltage_v: float) -> None:
         """Set the voltage of the modules' supply from the next tick on.
