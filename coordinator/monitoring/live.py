@@ -51,6 +51,7 @@ class LiveMonitor:
         self._report = report
         self._serials: Sequence[str] = monitor.reference.chain.serials
         self._clocks: Mapping[str, ClockMap] | None = None
+        self._mapped_ns = 0
         self._boots: dict[str, int] = {}
         self._left: tuple[str, ...] = ()
 
@@ -63,26 +64,25 @@ class LiveMonitor:
     ) -> None:
         """Watch until a time [ns], until it is enough, or until cancelled."""
         asking = asyncio.create_task(self._ask_all(messenger))
-        mapped_ns = 0
         try:
             while (until_ns is None or self._clock() < until_ns) and not enough():
                 await asyncio.sleep(self._update_s)
                 self._note_presence(messenger)
-                if self._clocks is None or self._clock() - mapped_ns > REMAP_S * 1e9:
-                    self._map_clocks()
-                    mapped_ns = self._clock()
-                if self._clocks is not None:
-                    self._look(self._clocks)
-                self._forget()
+                self.look()
         finally:
             asking.cancel()
             await asyncio.gather(asking, return_exceptions=True)
 
-    def _look(self, clocks: Mapping[str, ClockMap]) -> None:
-        """Look at what was received since the last look."""
-        update = self._monitor.advance(self.recording, clocks)
-        if any(update):
-            self._report(update)
+    def look(self) -> None:
+        """Look at what was recorded since the last look, by clocks that are mapped anew every `REMAP_S`."""
+        if self._clocks is None or self._clock() - self._mapped_ns > REMAP_S * 1e9:
+            self._map_clocks()
+            self._mapped_ns = self._clock()
+        if self._clocks is not None:
+            update = self._monitor.advance(self.recording, self._clocks)
+            if any(update):
+                self._report(update)
+        self._forget()
 
     def _forget(self) -> None:
         """Forget what was looked at, and what waits for modules that are not there."""
