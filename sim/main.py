@@ -14,6 +14,10 @@ COMMANDS = {
     "benchmark": ("benchmark.app", "Measure the whole system against its bars."),
     "thesis": ("thesis.thesis", "Repeat the thesis' experiments and compare with what it printed."),
     "monitoring": ("monitoring.monitoring", "Count what the monitor finds, and its false alarms."),
+    "watch": (
+        "watch.watch",
+        "Count false alarms in hours of everyday use, and what of slow changes is named.",
+    ),
     "faults": ("faults.faults", "Search for faults that the system does not survive."),
     "compare-log": ("compare_log.compare_log", "Compare a real module's log with the simulated module."),
 }
@@ -28,6 +32,7 @@ EXAMPLES = {
     "score": "x5-sim score runs/a2085_04",
     "thesis": "x5-sim thesis --quick --only figure19,table2 --out runs/thesis",
     "monitoring": "x5-sim monitoring --robot a2085_03 --hours 0.1",
+    "watch": "x5-sim watch --robot a2085_03 --hours 1 --kind friction --out runs/watch",
     "faults": "x5-sim faults --seeds 1..20 --workers 2",
     "compare-log": "x5-sim compare-log log.csv --out comparison",
 }

@@ -1,26 +1,22 @@
 """`x5-sim thesis`: the thesis' experiments on simulated modules, against what it printed."""
 
 import re
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from coordinator.report.plots import check_plots
-from coordinator.runtime.command_line import fail, with_options
-from coordinator.runtime.terminal import Terminal, new_table, print_table
-from module_agent.model.errors import EXIT_FAILED
-from sim.benchmark.case import Failed, Trial
-from sim.benchmark.workers import run_trials
-from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.terminal import new_table, print_table
+from sim.commands.experiment import ModuleOptions, WorkerCount, measured_units
 from sim.thesis.dynamics.assistance_experiments import ASSISTANCE_EXPERIMENTS
 from sim.thesis.dynamics.gain_experiments import GAIN_EXPERIMENTS
 from sim.thesis.dynamics.parameter_experiments import PARAMETER_EXPERIMENTS
-from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
+from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults
 from sim.thesis.future_work.experiment import FUTURE_WORK
 from sim.thesis.kinematics.configuration_experiments import CONFIGURATION_EXPERIMENTS
 from sim.thesis.kinematics.equation16 import EQUATION_16
@@ -70,7 +66,7 @@ def thesis(
     choice = modules.choice()
     chosen = selected(EXPERIMENTS, [name.strip() for name in only.split(",") if name.strip()])
     scope = Scope(modules.seed, choice, quick)
-    measured = _measured(chosen, scope, Store(out / "measured"), processes)
+    measured = measured_units(units_of(chosen, scope), Store(out / "measured"), processes)
     settings: dict[str, int | str | bool | tuple[str, ...]] = {
         "seed": modules.seed,
         "noise": modules.noise,
@@ -83,49 +79,6 @@ def thesis(
     write_results(out, outcome)
     print_table(outcome_table(outcome.experiments))
     typer.echo(f"{counted(outcome)} Report: {out / HTML}")
-
-
-def _measured(
-    chosen: Sequence[Experiment], scope: Scope, store: Store, processes: int | None
-) -> dict[str, Any]:
-    """Measure what the store does not have, keep each result as it comes, and return all by key.
-
-    The first unit that fails ends the command with `EXIT_FAILED`; what is measured stays in the store.
-    """
-    units = units_of(chosen, scope)
-    measured = {key: known for key, unit in units.items() if (known := store.load(key, unit)) is not None}
-    missing = [(key, unit) for key, unit in units.items() if key not in measured]
-    with experiment("what is measured is kept: the same command continues") as terminal:
-        progress = _Progress(terminal, [unit for _, unit in missing], len(units))
-
-        def done(index: int, result: Any) -> None:
-            key, unit = missing[index]
-            if isinstance(result, Failed):
-                fail(result.text, EXIT_FAILED)
-            store.keep(key, unit, result)
-            measured[key] = result
-            progress.step(unit)
-
-        trials = [Trial(unit.work, unit.arguments, unit.cost_s) for _, unit in missing]
-        run_trials(trials, worker_count(processes), done)
-    return measured
-
-
-class _Progress:
-    """Shows how many units are done, and the time left by their costs and the time so far."""
-
-    def __init__(self, terminal: Terminal, missing: Sequence[Unit], total: int):
-        self._terminal, self._total = terminal, total
-        self._done = total - len(missing)
-        self._cost_s, self._over_s = sum(unit.cost_s for unit in missing), 0.0
-        self._start_s = time.monotonic()
-
-    def step(self, unit: Unit) -> None:
-        """Show that a unit is done."""
-        self._done += 1
-        self._over_s += unit.cost_s
-        left_s = (time.monotonic() - self._start_s) * (self._cost_s / self._over_s - 1.0)
-        self._terminal.step(self._done, self._total, f"{unit.name}; about {left_s:.0f} s left")
 
 
 def outcome_table(experiments: Sequence[ExperimentResult]) -> Table:

@@ -28,7 +28,7 @@ from module_agent.wire.messages import (
 
 SENDER = "experiment"
 # As often as the coordinator does; a lease without it lapses.
-_KEEP_ALIVE_NS = 60_000_000
+KEEP_ALIVE_NS = 60_000_000
 _ASKED = 1
 
 
@@ -39,10 +39,11 @@ class ExperimentFailed(RobotError):
 class ModuleBench:
     """A module under command from its first tick to its last."""
 
-    def __init__(self, firmware: Firmware):
+    def __init__(self, firmware: Firmware, keep_alive_ns: int = KEEP_ALIVE_NS):
         self.firmware = firmware
         self.serial = firmware.config.serial
         self.now_ns = 0
+        self._keep_alive_ns = keep_alive_ns
         self.published_rows = False
         self.winding_c = 0.0
         self._record: MotionRecord | None = None
@@ -58,8 +59,15 @@ class ModuleBench:
         waiting, self._waiting = self._waiting, []
         return self.firmware.step(sample, [*waiting, *arrived])
 
-    def publish(self, pwm: float) -> None:
-        """End the tick with the module's PWM. `published_rows` says afterwards whether feedback went out.
+    @property
+    def has_mail(self) -> bool:
+        """Whether something waits for the next tick."""
+        return bool(self._waiting)
+
+    def publish(self, pwm: float) -> list[Outgoing]:
+        """End the tick with the module's PWM; return what it sends.
+
+        `published_rows` says afterwards whether feedback went out.
 
         Raises:
             ExperimentFailed: the module refused a command that was sent since the last tick.
@@ -68,6 +76,7 @@ class ModuleBench:
         self.published_rows = any(isinstance(one, Publication) and one.leaf is Leaf.FEEDBACK for one in out)
         for outgoing in out:
             self._note(outgoing)
+        return out
 
     def start(self, pattern: Pattern, effort: EffortProfile | None = None) -> None:
         """Start a motion in the next tick, with feed-forward efforts if given."""
@@ -111,7 +120,7 @@ class ModuleBench:
 
     def _keep_alive(self) -> None:
         first = self._renewed_ns is None
-        if self._renewed_ns is None or self.now_ns - self._renewed_ns >= _KEEP_ALIVE_NS:
+        if self._renewed_ns is None or self.now_ns - self._renewed_ns >= self._keep_alive_ns:
             lease = LeaseRequest(**self._head(), action="acquire" if first else "renew")
             self._waiting.append(Incoming(Leaf.LEASE, encode(lease), _ASKED if first else None))
             self._renewed_ns = self.now_ns

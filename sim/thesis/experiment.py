@@ -80,7 +80,8 @@ class Scope(NamedTuple):
 class Unit(NamedTuple):
     """One piece of work: a function of a module, its arguments, and the type of its result.
 
-    The type is one that pydantic writes as JSON and reads back. cost_s: processor time, roughly.
+    The type is one that pydantic writes as JSON and reads back. cost_s: processor time, roughly. shares: as
+    of a `Trial`.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Unit(NamedTuple):
     arguments: tuple[Any, ...]
     kind: Any
     cost_s: float
+    shares: str = ""
 
 
 class Findings(NamedTuple):

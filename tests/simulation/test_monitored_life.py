@@ -1,0 +1,41 @@
+"""Minutes of everyday use under the monitor: a change is named, a seed repeats, a canary sings."""
+
+import pytest
+
+from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, monitored_life
+
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("monitored life")
+
+# A robot that half a minute has made known, with calibrated sensors.
+PLAN = LifePlan("a2085_03", 3, "x5", day=0, for_s=20.0, brief=True)
+
+
+def test_friction_that_doubles_is_named_on_its_module() -> None:
+    stiff = monitored_life(PLAN._replace(change="friction", for_s=60.0, from_s=15.0, over_s=10.0))
+    assert stiff.change is not None
+    assert stiff.rightly, stiff.said
+    named = stiff.rightly[0]
+    assert named.serial == stiff.change.serial
+    assert named.t_s > stiff.change.from_s
+    assert named.change_size > 0.0
+
+
+def test_a_seed_repeats_a_life_and_another_day_is_another_life() -> None:
+    sensitive = PLAN._replace(alarms_per_hour=1e9)
+
+    def without_cost(life: Life) -> Life:
+        return life._replace(cpu_s=0.0)
+
+    one, again, other = (
+        without_cost(monitored_life(plan)) for plan in (sensitive, sensitive, sensitive._replace(day=1))
+    )
+    assert one == again
+    assert one.said != other.said
+
+
+def test_an_oversensitive_monitor_is_counted_as_false_alarms() -> None:
+    """The canary: with thresholds that chance exceeds all the time, a count of none would be blind."""
+    alarms = false_alarms([monitored_life(PLAN._replace(alarms_per_hour=1e9))])
+    assert alarms.alarms > 0
+    assert alarms.per_hour > 100.0
