@@ -104,12 +104,19 @@ class Fault(NamedTuple):
         )
         return f"{self.kind}{where} {when}, size {self.size:.3f}"
 
+    def modules(self, count: int) -> tuple[int, ...]:
+        """Return the indices of the modules, of `count`, that it happens to; IMUs of two are exchanged."""
+        if not self.of_a_module:
+            return ()
+        return (self.module, (self.module + 1) % count) if self.kind == "IMU swapped" else (self.module,)
+
     def is_named(self, text: str, serials: tuple[str, ...]) -> bool:
         """Return whether a sentence names this fault: its words, and its module where it has one."""
         said = text.lower()
         words = not self.nature.words or any(word.lower() in said for word in self.nature.words)
         # How many modules are missing, and which are there, names those that are not.
-        named = serials[self.module] in text or (self.nature.part == "agent" and "expected, found" in said)
+        sick = [serials[index] for index in self.modules(len(serials))]
+        named = any(s in text for s in sick) or (self.nature.part == "agent" and "expected, found" in said)
         return words and (named or not self.of_a_module)
 
 

@@ -41,10 +41,8 @@ def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
     """Return whether an ending accuses modules, and none of those that something happened to."""
     if ending.name in ("result", "lost", "unbounded") or not all(f.of_a_module for f in schedule.faults):
         return False
-    serials, modules = schedule.robot.serials, len(schedule.robot.modules)
-    sick = {serials[fault.module] for fault in schedule.faults}
-    # The IMUs of two modules are exchanged.
-    sick |= {serials[(f.module + 1) % modules] for f in schedule.faults if f.kind == "IMU swapped"}
+    serials = schedule.robot.serials
+    sick = {serials[index] for fault in schedule.faults for index in fault.modules(len(serials))}
     accused = {serial for serial in serials if serial in ending.text}
     # How many were found, and which, says which were not.
     return bool(accused) and not accused & sick and "expected, found" not in ending.text

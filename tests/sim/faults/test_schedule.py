@@ -56,6 +56,19 @@ def test_a_fault_reads_back_from_its_text(drawn: Any) -> None:
             fault_of(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("A: check how its IMU is mounted", True),
+        ("C: the residual of its gyro is 0.3 rad/s", True),
+        ("B: the residual of its gyro is 0.3 rad/s", False),
+        ("C: its encoder is stuck", False),
+    ],
+)
+def test_exchanged_imus_are_named_by_either_of_their_modules(text: str, named: bool) -> None:
+    assert Fault("IMU swapped", 1.0, math.inf, module=2).is_named(text, ("A", "B", "C")) is named
+
+
 def test_simpler_sessions_are_fewer_faults_smaller_robots_and_shorter_times() -> None:
     faults = (Fault("agent thaw", 1.0, 0.8, 2), Fault("agent crash", 2.0, math.inf, 0))
     start = schedule.Schedule(5, load_robot("a2085_03"), "wifi", faults)
