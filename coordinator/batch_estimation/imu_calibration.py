@@ -76,6 +76,12 @@ class ImuCalibration(NamedTuple):
         spread[list(modules), _DISPLACEMENT] = sigma_m**2
         return self._replace(covariance=frozen(self.covariance + np.diag(spread.ravel())))
 
+    def with_any_scale(self, modules: Sequence[int], sigma: float) -> "ImuCalibration":
+        """Return the same with further errors of scale and axes of some IMUs, independent of all else."""
+        spread = np.zeros(self.mean.shape)
+        spread[list(modules), : GYRO_BIAS.start] = sigma**2
+        return self._replace(covariance=frozen(self.covariance + np.diag(spread.ravel())))
+
     def information(self) -> tuple[Array, "NDArray[np.int64]"]:
         """Return the inverse of the covariance of what is free, and the rows of that."""
         rows = np.flatnonzero(np.tile(self.free, len(self.serials)))

@@ -11,7 +11,7 @@ import numpy as np
 from coordinator.batch_estimation.encoder_scale import with_encoder_scales
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_calibration import ImuCalibration, catalogued
-from coordinator.batch_estimation.imu_intrinsics import DELAY, beyond
+from coordinator.batch_estimation.imu_intrinsics import DELAY, GYRO_BIAS, beyond
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import (
     ComplianceJacobian,
@@ -47,6 +47,9 @@ SUSPICIOUS, SIGNIFICANT = 3.0, 4.0
 MIN_SHAKING = 0.005
 # Prior of the place of an IMU whose module's type may be another; smallest difference in scale that counts.
 ANYWHERE_M, MIN_SCALE = 0.05, 5e-4
+# Prior of scale and axes of an IMU that may be sick. As delivered, IMUs are off by 1 %. What links that bend
+# are taken for is smaller, or beyond reason, or less certain than this many standard deviations.
+SICK_SCALE, SICK_FROM, SICK_TO, CERTAIN = 0.05, 0.02, 0.2, 8.0
 
 
 class Suspects(NamedTuple):
@@ -54,11 +57,13 @@ class Suspects(NamedTuple):
 
     imus: modules whose IMUs may sit anywhere in their housings. encoders: joints whose encoders may be off
     in scale. scale: (n,) by how much these are off as far as it is known, true motion over measured, less 1.
+    sick: modules whose IMUs may have any scale and axes.
     """
 
     imus: tuple[int, ...]
     encoders: tuple[int, ...]
     scale: Array
+    sick: tuple[int, ...] = ()
 
 
 def refine_checked(
@@ -74,8 +79,9 @@ def refine_checked(
     """Refine as `refine_robot`; what contradicts the catalogue is free, so that the claim covers it.
 
     The scales of `doubted` encoders are free in any case. If errors of IMUs or scales of encoders are
-    outliers, the last fit is repeated with all IMUs anywhere and all scales free. Those that are significant
-    then stay free in the fit that is returned.
+    outliers, the last fit is repeated with all IMUs anywhere and all scales free, and with the IMUs' own
+    errors free instead. What is significant then, in the one that explains more, stays free in the fit that
+    is returned.
     """
     known = calibration if calibration is not None else catalogued(chain.serials, prior)
     count = len(chain.serials)
@@ -88,6 +94,14 @@ def refine_checked(
     freed = Suspects(everyone, everyone, suspects.scale)
     anywhere = known.widened(everyone, ANYWHERE_M)
     free = _with_encoders(fitted.last, fitted.data, prior, fitted.flex, anywhere, freed, noise, coarse=True)
+    any_errors = known.with_any_scale(everyone, SICK_SCALE)
+    own = _with_encoders(
+        fitted.last, fitted.data, prior, fitted.flex, any_errors, suspects, noise, coarse=True
+    )
+    sick = sick_imus(own, known)
+    if sick and _misfit(own) < _misfit(free):
+        suspects = suspects._replace(sick=sick)
+        return refine_robot(own.chain, kinds, windows, prior, floor, known, suspects, noise), suspects
     moved = free.placement - known.placement
     away = np.abs(moved / np.hypot(free.placement_sigma, known.placement_sigma))[:, 3:].max(axis=1)
     off = _scale_sigmas(free) > SIGNIFICANT
@@ -104,6 +118,16 @@ def _outlier(refined: Refinement, prior: ImuPrior, known: ImuCalibration) -> flo
     moved = np.abs((refined.placement - known.placement)[:, 3:])
     placed = (moved / known.placement_sigma[:, 3:]).max() if prior.place_m else 0.0
     return float(max(placed, beyond(refined.intrinsics, prior).max(), _scale_sigmas(refined).max()))
+
+
+def sick_imus(own: Refinement, known: ImuCalibration) -> tuple[int, ...]:
+    """Return the IMUs whose scale or axes are surely not what is known of them."""
+    matrices = slice(0, GYRO_BIAS.start)
+    off = np.abs(own.calibration.mean - known.mean)[:, matrices]
+    measured, before = own.calibration.sigma[:, matrices], known.sigma[:, matrices]
+    certain = (off > CERTAIN * measured) & (off > SIGNIFICANT * np.hypot(measured, before))
+    sick = (certain & (off > SICK_FROM)).any(axis=1) & (off < SICK_TO).all(axis=1)
+    return tuple(np.flatnonzero(sick).tolist())
 
 
 def _scale_sigmas(refined: Refinement) -> Array:
@@ -169,7 +193,7 @@ def _fitted(
     suspects = suspects or Suspects((), (), np.zeros(count))
     windows = [_rescaled(one, suspects.scale) for one in windows]
     known = calibration if calibration is not None else catalogued(chain.serials, prior)
-    known = known.widened(suspects.imus, ANYWHERE_M)
+    known = known.widened(suspects.imus, ANYWHERE_M).with_any_scale(suspects.sick, SICK_SCALE)
     keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
     parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor) for one in windows]
     rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior, None, known)

@@ -209,12 +209,21 @@ def test_a_sick_module_is_named_and_the_robot_identified_without_it(run: list[En
     _covered(found.kinematics)
 
 
-def test_an_accelerometer_of_another_scale_ends_with_its_name(run: list[Entry]) -> None:
-    """The fit takes 5 % for a bias, and the link for 17 mm longer: the bias is what no calibrated IMU has."""
-    found = identify(_sick(run, multiplied(("accel_m_s2",), 1.05), ELBOW))
-    (finding,) = [one for one in found.result.sensors if one.kind == "imu_error" and one.serial == ELBOW]
-    assert finding.serious
-    assert any(ELBOW in sentence for sentence in found.result.suspicions)
+@pytest.mark.parametrize("sensor", ["gyro", "accelerometer"])
+def test_an_imu_of_another_scale_ends_with_its_name_and_the_right_links(
+    run: list[Entry], sensor: str
+) -> None:
+    """5 %. Taken for a bias it makes the link 17 mm longer, taken for the lift's encoder 15 mm shorter."""
+    field = {"gyro": "gyro_rad_s", "accelerometer": "accel_m_s2"}[sensor]
+    found = identify(_sick(run, multiplied((field,), 1.05), ELBOW))
+    (finding,) = found.kinematics.findings
+    assert (finding.serial, finding.kind, finding.serious) == (ELBOW, "imu_error", True)
+    assert finding.what == f"an error of its {sensor}'s scale or axes"
+    assert finding.measured == pytest.approx(0.05, abs=0.01)
+    (sentence,) = found.result.suspicions
+    assert ELBOW in sentence
+    _covered(found.kinematics)
+    assert found.kinematics.fit.link_length_sigma_m[1:].max() < 2e-3
 
 
 def test_readings_that_are_no_numbers_are_counted_and_the_others_used(run: list[Entry]) -> None:
