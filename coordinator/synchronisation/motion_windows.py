@@ -144,16 +144,22 @@ def _aligned(tracks: Sequence["_Track"], start_ns: int, end_ns: int, bridged_ns:
     start_ns = max(start_ns, *(int(t[0]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     end_ns = min(end_ns, *(int(t[-1]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
-    joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common, bridged_ns)
-    imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common, bridged_ns)
+    names = [track.name for track in tracks]
+    of_joints, of_imus = [track.t_ns for track in tracks], [track.imu_t_ns for track in tracks]
+    joint = resample(of_joints, [track.joint for track in tracks], common, bridged_ns, names)
+    imu = resample(of_imus, [track.imu for track in tracks], common, bridged_ns, names)
     changes = [np.diff(np.unique(track.joint[:, 0])) for track in tracks]
     step = np.array([float(change.min()) if change.size else 0.0 for change in changes])
     return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:], step)
 
 
 class _Track(NamedTuple):
-    """One module in session time: position and effort (m, 2); gyro and accelerometer (k, 6)."""
+    """One module in session time: position and effort (m, 2); gyro and accelerometer (k, 6).
 
+    name: which module, in which motion.
+    """
+
+    name: str
     t_ns: NDArray[np.int64]
     imu_t_ns: NDArray[np.int64]
     joint: Array
@@ -170,7 +176,8 @@ class _Track(NamedTuple):
     def between(self, start_ns: int, end_ns: int) -> "_Track":
         """Return the samples within a span, both ends included."""
         of_joint, of_imu = ((t >= start_ns) & (t <= end_ns) for t in (self.t_ns, self.imu_t_ns))
-        return _Track(self.t_ns[of_joint], self.imu_t_ns[of_imu], self.joint[of_joint], self.imu[of_imu])
+        times = self.t_ns[of_joint], self.imu_t_ns[of_imu]
+        return _Track(self.name, *times, self.joint[of_joint], self.imu[of_imu])
 
 
 def _track(
@@ -183,6 +190,7 @@ def _track(
     # An IMU that is slower than the rows repeats its samples.
     imu_t_ns, fresh = np.unique(rows["imu_t_ns"], return_index=True)
     return _Track(
+        f"module {serial} in the {event.purpose} motion of {event.serial}",
         clock.to_session(rows["t_ns"].astype(np.int64)),
         clock.to_session(imu_t_ns.astype(np.int64)),
         np.column_stack([rows[field] for field in ("position_rad", "effort_nm")]),

@@ -75,6 +75,7 @@ def resample(
     signals: Sequence[ArrayLike],
     t_common_ns: ArrayLike,
     max_gap_ns: int = MAX_GAP_NS,
+    names: Sequence[str] = (),
 ) -> Array:
     """Interpolate the signal of every module onto one time base, by a cubic spline (0.005 % off at 10 Hz).
 
@@ -83,13 +84,14 @@ def resample(
         signals: per module the values (m_i,), or (m_i, k) of k signals that were sampled together.
         t_common_ns: (m,) times to interpolate to.
         max_gap_ns: the longest hole between samples that is bridged.
+        names: what messages call the modules; by default the columns.
 
     Returns:
         (m, n), or (m, n, k), read-only.
 
     Raises:
         DataError: times out of order, a hole that is too long, or a common time outside a module's samples;
-            the message gives the column.
+            the message names the module.
     """
     common = np.asarray(t_common_ns, dtype=np.int64)
     if len(t_ns) != len(signals):
@@ -99,7 +101,7 @@ def resample(
     resampled = np.empty((common.size, len(signals), *np.shape(signals[0])[1:]))
     for column, (times, values) in enumerate(zip(t_ns, signals, strict=True)):
         known = np.asarray(times, dtype=np.int64)
-        _check_times(column, known, common, max_gap_ns)
+        _check_times(names[column] if names else f"column {column}", known, common, max_gap_ns)
         # Nanoseconds since an epoch need more digits than a float has: subtract first.
         spline = make_interp_spline((known - known[0]) / NS_PER_S, np.asarray(values, dtype=float))
         resampled[:, column] = spline((common - known[0]) / NS_PER_S)
@@ -280,23 +282,21 @@ def filtered_motion(
     return JointMotion(read_only(times[kept].copy()), *(read_only(signal[kept].copy()) for signal in motion))
 
 
-def _check_times(column: int, known: NDArray[np.int64], common: NDArray[np.int64], max_gap_ns: int) -> None:
+def _check_times(name: str, known: NDArray[np.int64], common: NDArray[np.int64], max_gap_ns: int) -> None:
     if known.size < 4:
-        raise DataError(f"column {column} has {known.size} samples; at least 4 are needed to interpolate")
+        raise DataError(f"{name} has {known.size} samples; at least 4 are needed to interpolate")
     steps = np.diff(known)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
-        raise DataError(
-            f"column {column}: the time of sample {row} is not after that of the sample before it"
-        )
+        raise DataError(f"{name}: the time of sample {row} is not after that of the sample before it")
     if common.size and (common.min() < known[0] or common.max() > known[-1]):
         raise DataError(
-            f"column {column} has samples from {known[0]} to {known[-1]} ns; the common times run from "
+            f"{name} has samples from {known[0]} to {known[-1]} ns; the common times run from "
             f"{common.min()} to {common.max()} ns, and nothing is extrapolated"
         )
     if steps.max() > max_gap_ns:
         row = int(np.argmax(steps)) + 1
         raise DataError(
-            f"column {column} has a hole of {steps.max() / 1e6:.1f} ms before sample {row}; "
+            f"{name} has a hole of {steps.max() / 1e6:.1f} ms before sample {row}; "
             f"at most {max_gap_ns / 1e6:.1f} ms are bridged"
         )

@@ -128,7 +128,7 @@ def test_repeated_rows_and_samples_do_not_change_the_window(wire: SimpleNamespac
 
 
 def test_a_hole_is_named_by_its_module_and_not_bridged(wire: SimpleNamespace) -> None:
-    with pytest.raises(DataError, match=r"column 1 has a hole of 84\.0 ms"):
+    with pytest.raises(DataError, match=r"module B in the constant motion of A has a hole of 84\.0 ms"):
         window(_recording(wire, {"B": (600, 620)}), CLOCKS, SERIALS, _event(wire))
 
 
@@ -155,7 +155,7 @@ def test_a_motion_without_holes_is_one_window(wire: SimpleNamespace) -> None:
 
 def test_a_motion_of_holes_alone_is_refused(wire: SimpleNamespace) -> None:
     recording = _recording(wire, {"B": (450, 950)})
-    with pytest.raises(DataError, match=r"column 1 has a hole of 2004\.0 ms"):
+    with pytest.raises(DataError, match=r"module B in the constant motion of A has a hole of 2004\.0 ms"):
         unbroken_windows(recording, CLOCKS, SERIALS, _event(wire), cutoff_hz=12.0)
 
 
