@@ -21,9 +21,20 @@ class Nature(NamedTuple):
     words: tuple[str, ...] = ()
 
 
-_NETWORK = ("answer", "network", "slow", "late", "lost", "heard", "expired", "lease", "expected, found")
+_NETWORK = (
+    "answer",
+    "network",
+    "slow",
+    "late",
+    "lost",
+    "heard",
+    "expired",
+    "lease",
+    "malformed",
+    "expected, found",
+)
 _TIME = ("clock", "time", "expired", "lease")
-_POSITION = ("position", "encoder", "moved", "turn")
+_POSITION = ("position", "velocity", "encoder", "moved", "turn")
 _IMU = ("gyro", "accel", "imu", "specific force", "gravity")
 _TORQUE = ("effort", "torque")
 

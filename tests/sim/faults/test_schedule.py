@@ -69,6 +69,12 @@ def test_exchanged_imus_are_named_by_either_of_their_modules(text: str, named: b
     assert Fault("IMU swapped", 1.0, math.inf, module=2).is_named(text, ("A", "B", "C")) is named
 
 
+def test_a_message_that_is_malformed_names_what_corrupts_messages() -> None:
+    text = "module A refused motion: malformed: not a msgpack map"
+    assert Fault("corrupted messages", 1.0, 0.5).is_named(text, ("A", "B"))
+    assert not Fault("agent crash", 1.0, math.inf, module=1).is_named(text, ("A", "B"))
+
+
 def test_simpler_sessions_are_fewer_faults_smaller_robots_and_shorter_times() -> None:
     faults = (Fault("agent thaw", 1.0, 0.8, 2), Fault("agent crash", 2.0, math.inf, 0))
     start = schedule.Schedule(5, load_robot("a2085_03"), "wifi", faults)
