@@ -30,6 +30,7 @@ GROUPS = {
         "sim.sensors.imu",
         "sim.sensors.joint",
         "sim.sensors.sensors",
+        "sim.sensors.alteration",
         "sim.world.world_kernel",
         "sim.virtual_time.quiet_run",
         "sim.world.barrier",
@@ -73,6 +74,7 @@ def _call_world() -> None:
     from module_agent.network_emulation.profile import PROFILES
     from sim.physics.engine import Physics
     from sim.robot.robot_file import load_robot
+    from sim.sensors.alteration import alter, unaltered
     from sim.virtual_time.robot import VirtualSettings, virtual_robot
     from sim.world.world import World
 
@@ -82,6 +84,8 @@ def _call_world() -> None:
         world = World(robot, seed=1, physics=physics)
         readings = world.exchange([0.0] * len(robot.modules))
         world.close()
+    read = readings.integers, readings.floats
+    alter(0, *read, tuple(unaltered(len(readings))), *read)
     QuietTicks(len(readings)).run(readings, busy=[])
     _call_bus(robot)
     with virtual_robot(VirtualSettings(robot, PROFILES["none"])) as alone:
