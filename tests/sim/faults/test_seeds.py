@@ -6,12 +6,14 @@ from sim.faults.fault import KINDS
 from sim.faults.report import run_seed
 from sim.faults.schedule import draw
 
-# One or two seconds each, a few five, and together every kind of fault.
+# A second each, a few three, and together every kind of fault. They are fixed: a change is not to be refused
+# for a fault that was there before it, which fresh seeds find.
 SEEDS = (
     *(4, 5, 6, 9, 13, 15, 16, 27, 37, 42, 45, 59, 63, 65, 73, 81, 86, 107, 110, 111),
     *(1012, 1024, 1034, 1039, 1041, 1060, 1064, 1114, 12),
     # Found by the search, and mended: motors too fast, a brake taken for drive, IMUs exchanged.
     *(19, 39, 24, 2006, 3037),
+    *range(5000, 5066),
 )
 
 
