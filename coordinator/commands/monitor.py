@@ -18,7 +18,7 @@ from coordinator.live_robot.messenger import Messenger
 from coordinator.monitoring.live import UPDATE_S, LiveMonitor, retained_rows
 from coordinator.monitoring.live_states import LiveStates
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
-from coordinator.monitoring.monitor import Monitor
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
@@ -72,6 +72,7 @@ def monitor_robot(
     monitor = Monitor(reference, alarms_per_hour)
     screen = MonitorScreen(monitor, json_file, at.quiet)
     with screen:
+        screen.report(MonitorUpdate((), (), reference.remarks))
         if recording is not None:
             _monitor_file(monitor, screen, recording)
         else:
