@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from coordinator.excitation.d_optimal import draw_possible
-from coordinator.excitation.plan import Plan
+from coordinator.excitation.plan import Excitation, Plan
 from coordinator.excitation.robot_excitation import RobotModule, excitation_task
 from coordinator.excitation.segment import RobotMotion, Segment
 from coordinator.monitoring.findings import Finding, Key
@@ -57,8 +57,8 @@ OUTCOMES: tuple[Outcome, ...] = ("rightly", "and wrongly", "wrongly", "missed")
 class LifePlan(NamedTuple):
     """A stretch of life: whose, on which day, for how long; what changes, from when on, and over how long.
 
-    alarms_per_hour: what the monitor is asked for. brief: the robot became known by a shorter run than that
-    of the default plan.
+    excitation: of the run that the robot is known from. alarms_per_hour: what the monitor is asked for.
+    brief: that run is shorter than the default one.
     """
 
     robot: str
@@ -67,6 +67,7 @@ class LifePlan(NamedTuple):
     day: int
     for_s: float
     change: ChangeKind | None = None
+    excitation: Excitation = "joint-by-joint"
     alarms_per_hour: float = ALARMS_PER_HOUR
     brief: bool = False
     from_s: float = ONSET_S
@@ -150,7 +151,7 @@ def monitored_life(plan: LifePlan) -> Life:
         ExperimentFailed: a motion was interrupted.
     """
     begin_s = time.process_time()
-    known = known_robot_of(plan.robot, plan.seed, plan.noise, plan.brief)
+    known = known_robot_of(plan.robot, plan.seed, plan.noise, plan.excitation, plan.brief)
     rng = np.random.default_rng((plan.seed, plan.day, 0x11FE))
     weather = draw_weather(len(known.robot.serials), rng)
     change = None
@@ -221,10 +222,12 @@ def _identity(finding: Finding) -> tuple[Key, str, str, int]:
 
 
 @lru_cache(maxsize=1)
-def known_robot_of(name: str, seed: int, noise: str, brief: bool = False) -> KnownRobot:
+def known_robot_of(
+    name: str, seed: int, noise: str, excitation: Excitation, brief: bool = False
+) -> KnownRobot:
     """Return a robot as its first run has identified it, and motions for its lives.
 
-    brief: by a run with all joints at once, which takes half a minute.
+    brief: by a run that explores all joints at once, which takes half a minute.
 
     Raises:
         RobotFileError: there is no such robot.
@@ -232,7 +235,7 @@ def known_robot_of(name: str, seed: int, noise: str, brief: bool = False) -> Kno
     """
     profile = noise_profile(noise)
     robot = at_random_site(load_robot(name), seed)
-    plan = Plan(imu=imu_kind(profile))
+    plan = Plan(imu=imu_kind(profile), excitation=excitation)
     if brief:
         plan = plan.model_copy(update=_BRIEF)
     settings = VirtualSettings(robot, PROFILES["lan"], seed, profile, noise_seed=seed * _DAYS)
@@ -254,7 +257,7 @@ def known_robot_of(name: str, seed: int, noise: str, brief: bool = False) -> Kno
     return KnownRobot(robot, build_reference(known), motions)
 
 
-_BRIEF = {"mode": "simultaneous", "excitation": "d-optimal", "excitation_motions": 4, "excitation_s": 4.0}
+_BRIEF = {"mode": "simultaneous", "excitation_motions": 4, "excitation_s": 4.0}
 
 
 # A life without change: some minutes of work, which is what an interruption costs.
@@ -270,6 +273,7 @@ def lives(
     trials: int,
     seed: int,
     noise: str,
+    excitation: Excitation,
 ) -> list[LifePlan]:
     """Return lives without change that last so many hours, shared among robots, and some with each kind."""
     plans = []
@@ -282,7 +286,7 @@ def lives(
         changed_s = ONSET_S + GROWS_S + STAYS_S
         stretches += [(changed_s, kind) for _ in range(trials) for kind in kinds]
         for day, (for_s, kind) in enumerate(stretches):
-            plans.append(LifePlan(robot, 1000 * seed + day // LIVES, noise, day, for_s, kind))
+            plans.append(LifePlan(robot, 1000 * seed + day // LIVES, noise, day, for_s, kind, excitation))
     return plans
 
 

@@ -8,6 +8,7 @@ import typer
 from rich.table import Table
 
 from coordinator.commands.options import JsonFile
+from coordinator.excitation.plan import Excitation
 from coordinator.monitoring.reference import ALARMS_PER_HOUR
 from coordinator.runtime.terminal import figure, new_table, print_table, write_result
 from module_agent.model.errors import UsageError
@@ -41,6 +42,9 @@ def watch(
         typer.Option(help=f"A robot of `x5-sim robots`, or a file; repeat for more [{', '.join(ROBOTS)}]."),
     ] = None,
     noise: ProfileName = DEFAULT_PROFILE,
+    excitation: Annotated[
+        Excitation, typer.Option(help="Of the run that a robot is known from, as of `x5-coordinator run`.")
+    ] = "joint-by-joint",
     hours: Annotated[
         float, typer.Option(min=0.0, max=10_000.0, help="Time in which nothing changes, all robots together.")
     ] = 1.0,
@@ -65,7 +69,8 @@ def watch(
     for one in robots:
         load(one)
     noise_profile(noise)
-    planned = lives(robots, hours, [_kind(one) for one in kind or CHANGE_KINDS], trials, seed, noise)
+    kinds = [_kind(one) for one in kind or CHANGE_KINDS]
+    planned = lives(robots, hours, kinds, trials, seed, noise, excitation)
     if not planned:
         raise UsageError("--hours 0 and --trials 0 leave nothing to do")
     units = {key(unit): unit for unit in map(_unit, planned)}

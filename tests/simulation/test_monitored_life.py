@@ -1,18 +1,20 @@
 """Minutes of everyday use under the monitor: a change is named, a seed repeats, a canary sings."""
 
+import numpy as np
 import pytest
 
-from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, monitored_life
+from coordinator.monitoring.reference import ALONE_FACTOR
+from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, known_robot_of, monitored_life
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("monitored life")
 
 # A robot that half a minute has made known, with calibrated sensors.
-PLAN = LifePlan("a2085_03", 3, "x5", day=0, for_s=20.0, brief=True)
+PLAN = LifePlan("a2085_03", 3, "x5", day=0, for_s=20.0, excitation="d-optimal", brief=True)
 
 
 def test_friction_that_doubles_is_named_on_its_module() -> None:
-    stiff = monitored_life(PLAN._replace(change="friction", for_s=60.0, from_s=15.0, over_s=10.0))
+    stiff = monitored_life(PLAN._replace(change="friction", for_s=45.0, from_s=12.0, over_s=10.0))
     assert stiff.change is not None
     assert stiff.rightly, stiff.said
     named = stiff.rightly[0]
@@ -39,3 +41,17 @@ def test_an_oversensitive_monitor_is_counted_as_false_alarms() -> None:
     alarms = false_alarms([monitored_life(PLAN._replace(alarms_per_hour=1e9))])
     assert alarms.alarms > 0
     assert alarms.per_hour > 100.0
+
+
+def test_a_run_of_one_joint_at_a_time_is_compared_more_coarsely_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True
+    together = known_robot_of(*known).reference
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda speeds_rad_s: False)
+    alone = known_robot_of.__wrapped__(*known).reference
+    assert together.remarks == ()
+    assert "one at a time" in alone.remarks[0]
+    np.testing.assert_allclose(alone.contact.sigma_nm, ALONE_FACTOR * together.contact.sigma_nm)
+    # Gains are squares of sizes.
+    assert alone.torque.inflation == pytest.approx(ALONE_FACTOR**2 * together.torque.inflation)

@@ -66,7 +66,7 @@ def test_the_table_has_when_it_was_named_and_how_large_it_was_then() -> None:
 
 
 def test_hours_are_shared_among_robots_and_every_life_is_another() -> None:
-    planned = lives(("a2085_03", "arm6"), 1.0, ("play", "link"), 3, 0, "x5")
+    planned = lives(("a2085_03", "arm6"), 1.0, ("play", "link"), 3, 0, "x5", "d-optimal")
     for robot in ("a2085_03", "arm6"):
         own = [plan for plan in planned if plan.robot == robot]
         assert sum(plan.for_s for plan in own if plan.change is None) == 1800.0
