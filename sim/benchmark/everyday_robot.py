@@ -36,8 +36,8 @@ LIFETIME_NS, RENEWED_NS, BATCH_ROWS = 1_000_000_000, STATUS_PERIOD_NS // 2, 64
 _TICKS_OF_A_RUN = 256
 # Never: what the truth was is not kept.
 _NO_TRUTH = 1 << 62
-# Ranges of the speeds at which joints travel, and the mean and the longest of the pauses.
-TRAVEL_RAD_S, PAUSE_S, MAX_PAUSE_S, SETTLE_S = (0.4, 1.5), 4.0, 30.0, 0.3
+# Shares of the speed at which joints may travel, and the mean and the longest of the pauses.
+TRAVEL_SHARE, PAUSE_S, MAX_PAUSE_S, SETTLE_S = (0.4, 1.0), 4.0, 30.0, 0.3
 
 
 class Recurrent(NamedTuple):
@@ -165,9 +165,18 @@ class EverydayRobot:
                 self._feedback(Entry("publication", topic, self.world.t_ns, one.payload))
 
 
-def live(
-    robot: EverydayRobot, motions: Sequence[RobotMotion], for_s: float, rng: np.random.Generator
-) -> None:
+class Habits(NamedTuple):
+    """What a robot does every day: motions, and how it travels between them, as its plan has it.
+
+    Its ways lead over home, as those of a run: only they are known to be within what its motors can do.
+    """
+
+    motions: tuple[RobotMotion, ...]
+    home_rad: float
+    travel_rad_s: float
+
+
+def live(robot: EverydayRobot, habits: Habits, for_s: float, rng: np.random.Generator) -> None:
     """Move a robot about for some time [s]: to where a motion begins, the motion, a pause; all drawn.
 
     Raises:
@@ -175,9 +184,10 @@ def live(
     """
     end_ns = robot.world.t_ns + round(for_s * 1e9)
     while robot.world.t_ns < end_ns:
-        motion = motions[int(rng.integers(len(motions)))]
-        speed = float(rng.uniform(*TRAVEL_RAD_S))
-        robot.move({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in motion.pose_rad.items()})
+        motion = habits.motions[int(rng.integers(len(habits.motions)))]
+        speed = habits.travel_rad_s * float(rng.uniform(*TRAVEL_SHARE))
+        for pose in (dict.fromkeys(motion.pose_rad, habits.home_rad), motion.pose_rad):
+            robot.move({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in pose.items()})
         robot.wait(SETTLE_S)
         robot.move(dict(motion.patterns))
         robot.wait(min(float(rng.exponential(PAUSE_S)), MAX_PAUSE_S))

@@ -27,7 +27,7 @@ from module_agent.model.catalogue import module_type
 from module_agent.network_emulation.profile import PROFILES
 from sim.benchmark.cases.link_change import known_robot
 from sim.benchmark.cases.monitoring import Alarms, sum_of
-from sim.benchmark.everyday_robot import EverydayRobot, Recurrent, live
+from sim.benchmark.everyday_robot import EverydayRobot, Habits, Recurrent, live
 from sim.benchmark.slow_change import (
     GROWTHS,
     ChangeKind,
@@ -42,7 +42,7 @@ from sim.robot.variants import at_random_site
 from sim.virtual_time.robot import VirtualSettings
 
 # When a change begins, for how long it grows, and for how long it stays as large.
-ONSET_S, GROWS_S, STAYS_S = 60.0, 300.0, 60.0
+ONSET_S, GROWS_S, STAYS_S = 60.0, 180.0, 60.0
 # How often weather and growth are applied: a hundredth of a growth at a time is no blow.
 _STEP_NS = 2_000_000_000
 # The motions that a robot makes in its lives, and how many draws find them.
@@ -137,11 +137,11 @@ class Life(NamedTuple):
 
 
 class KnownRobot(NamedTuple):
-    """A robot, what a run has identified of it, and the motions that it makes."""
+    """A robot, what a run has identified of it, and what it does every day."""
 
     robot: Robot
     reference: Reference
-    motions: tuple[RobotMotion, ...]
+    habits: Habits
 
 
 def monitored_life(plan: LifePlan) -> Life:
@@ -177,7 +177,7 @@ def monitored_life(plan: LifePlan) -> Life:
         robot.repeat(Recurrent(_STEP_NS, lambda now_ns: changing.at(1e-9 * now_ns)))
         robot.repeat(Recurrent(round(1e9 * ASK_S), lambda _: _ask(robot, feed[0])))
         robot.repeat(Recurrent(round(1e9 * SEGMENT_S), lambda _: feed[0].look()))
-        live(robot, known.motions, plan.for_s, rng)
+        live(robot, known.habits, plan.for_s, rng)
     lasted_s = monitor.monitored_s
     return Life(
         plan,
@@ -254,7 +254,8 @@ def known_robot_of(
         )
         for one in segments
     )
-    return KnownRobot(robot, build_reference(known), motions)
+    habits = Habits(motions, plan.home_rad, plan.travel_speed_rad_s)
+    return KnownRobot(robot, build_reference(known), habits)
 
 
 _BRIEF = {"mode": "simultaneous", "excitation_motions": 4, "excitation_s": 4.0}
