@@ -345,7 +345,7 @@ def test_the_command_writes_its_results_and_measures_nothing_twice(
     def nothing_left(trials: list[object], *_: object) -> None:
         assert not trials
 
-    monkeypatch.setattr("sim.commands.thesis.run_trials", nothing_left)
+    monkeypatch.setattr("sim.commands.experiment.run_trials", nothing_left)
     again = CliRunner().invoke(app, arguments)
     assert again.exit_code == 0, again.output
     assert json.loads((tmp_path / "thesis.json").read_text()) == document
