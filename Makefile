@@ -9,12 +9,13 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo kinematics dynamics thesis test coverage safety mutants check bench clean
+.PHONY: help demo kinematics dynamics watch thesis test coverage safety mutants check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh in processes of its own, and is scored"
 	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
 	@echo "make dynamics    inertia, payloads, torque control and monitoring, every row in about a minute"
+	@echo "make watch   a night: 100 hours of everyday use under the monitor, and changes that grow slowly"
 	@echo "make thesis  the thesis' experiments side by side with what was printed, few trials, under three minutes"
 	@echo "make test    all tests"
 	@echo "make coverage  branch coverage of what runs in one process"
@@ -55,6 +56,11 @@ kinematics: $(STAMP)
 dynamics: $(DEV)
 	@mkdir -p runs
 	$(BIN)/x5-sim benchmark dynamics --quick --json runs/dynamics.json $(if $(TX40),--tx40 $(TX40))
+
+# A night: what is over is kept, and the same command continues.
+watch: $(STAMP)
+	@mkdir -p runs
+	$(BIN)/x5-sim watch --excitation d-optimal --hours 100 --trials 3 --out runs/watch --json runs/watch.json
 
 thesis: $(STAMP)
 	$(BIN)/x5-sim thesis --quick --out runs/thesis
