@@ -13,7 +13,7 @@ from coordinator.recording.run_folder import VIEW
 from coordinator.runtime.command_line import CommandFailed
 from coordinator.runtime.event_loop import SIGNALS
 from coordinator.viewer import viewer_process
-from coordinator.viewer.targets import SERVE_PORT, WEB_MEMORY, page_url
+from coordinator.viewer.targets import SERVE_PORT, page_url
 from module_agent.model.errors import EXIT_FAILED, UsageError
 
 _POLL_S = 0.2
@@ -50,8 +50,7 @@ def view(
     for taken in (port, port + 1):
         if viewer_process.listens("127.0.0.1", taken):
             raise UsageError(f"--port {port}: something listens on port {taken} already; choose another")
-    options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
-    served = viewer_process.start([str(recording), *options], port + 1, detached=False)
+    served = viewer_process.start([str(recording)], port + 1, detached=False, page_port=port)
     typer.echo(f"open {page_url(port)} in a browser; Ctrl-C ends it")
     ended = threading.Event()
     for number in SIGNALS:

@@ -1,7 +1,6 @@
 """Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page."""
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote, urlsplit
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
 NATIVE_PORT = 9876
 # Of pages served to a browser; their data are on the next one. (9090 is where rosbridge listens.)
 SERVE_PORT = 9878
-WEB_MEMORY = "256MB"
 SCHEMES = ("rerun", "rerun+http", "rerun+https")
 # Rows that are logged one by one, such as estimates, share a chunk of a file for this long.
 FILE_TICK_SECONDS = 10.0
@@ -86,11 +84,10 @@ def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
         file.set_sinks(rr.FileSink(str(targets.rrd)))
     urls, web_server, port = [targets.connect], None, targets.serve_port
     if targets.spawn:
-        native = viewer_process.listens("127.0.0.1", NATIVE_PORT) or _started("native", [], NATIVE_PORT)
+        native = viewer_process.listens("127.0.0.1", NATIVE_PORT) or _started("native", NATIVE_PORT)
         urls.insert(0, proxy_url(NATIVE_PORT) if native else None)
     if port is not None:
-        options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
-        web_server = _started("web", options, port + 1)
+        web_server = _started("web", port + 1, page_port=port)
     if port is not None and web_server is not None:
         urls.append(proxy_url(port + 1))
         logger.info("open %s in a browser", page_url(port))
@@ -123,10 +120,10 @@ def _reachable(url: str) -> bool:
     return False
 
 
-def _started(which: str, options: Sequence[str], port: int) -> viewer_process.ViewerProcess | None:
+def _started(which: str, port: int, page_port: int | None = None) -> viewer_process.ViewerProcess | None:
     """Start a viewer; only the native one outlives this process."""
     try:
-        return viewer_process.start(options, port, detached=which == "native")
+        return viewer_process.start([], port, detached=which == "native", page_port=page_port)
     except viewer_process.ViewerNotStarted as failure:
         logger.warning("the %s viewer did not start, so the run is not shown there: %s", which, failure)
         return None

@@ -21,6 +21,8 @@ from module_agent.model.errors import RobotError
 START_SECONDS = 15.0
 _POLL_SECONDS, _PROBE_SECONDS = 0.05, 0.5
 MERGE_SECONDS = 120.0
+# What the server of a page keeps for browsers that come later.
+PAGE_MEMORY = "256MB"
 MAGIC = b"RRF"
 # The reason of a failure is at the end of the output.
 REPORTED_LINES = 30
@@ -60,16 +62,21 @@ def executable() -> Path:
     return Path(on_path)
 
 
-def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess:
+def start(
+    options: Sequence[str], port: int, *, detached: bool, page_port: int | None = None
+) -> ViewerProcess:
     """Start the viewer, listening for data on `port` of 127.0.0.1, and wait until it does.
 
-    A detached viewer has its own session, so that neither Ctrl-C nor the end of this process ends it.
+    A detached viewer has its own session, so that neither Ctrl-C nor the end of this process ends it. With a
+    port for its page it is no window but serves a browser, and is waited for there, too.
 
     Raises:
         ViewerNotStarted: it ended or was not ready within `START_SECONDS`.
     """
     # By default the viewer listens on all interfaces; a run is shown on this machine only.
     command = [str(executable()), "--bind", "127.0.0.1", "--port", str(port), *options]
+    if page_port is not None:
+        command += ["--serve-web", "--web-viewer-port", str(page_port), "--server-memory-limit", PAGE_MEMORY]
     environment = {**os.environ, "RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
     output = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the viewer
     process = subprocess.Popen(
@@ -83,7 +90,8 @@ def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess
     started = ViewerProcess(process, output)
     deadline = time.monotonic() + START_SECONDS
     while process.poll() is None and time.monotonic() < deadline:
-        if listens("127.0.0.1", port):
+        # The page is served a moment after the data are received.
+        if listens("127.0.0.1", port) and (page_port is None or listens("127.0.0.1", page_port)):
             return started
         time.sleep(_POLL_SECONDS)
     output_tail = started.output_tail()
