@@ -93,6 +93,7 @@ class ModuleGroup:
         self._renewals: set[asyncio.Task[None]] = set()
         self._taken_by: dict[str, str] = {}
         self._running: dict[str, _Started] = {}
+        self._streams: set[str] = set()
         self._poor_until_ns = 0
 
     # ------------------------------------------------------------------ presence and state
@@ -194,7 +195,8 @@ class ModuleGroup:
         """Check that every module is still present and held.
 
         Raises:
-            ModuleLost: its token or feedback is missing, it has booted again, or its lease was taken.
+            ModuleLost: its token or feedback is missing, it has booted again, its lease was taken, or it
+                follows set-points of another program that has the secret of the lease.
             RobotStopped: a module that this sender holds was stopped.
         """
         now = self._clock()
@@ -212,6 +214,8 @@ class ModuleGroup:
             status = self._status_under_lease(serial)
             if status is not None and status.state == "stopped":
                 raise RobotStopped(serial, status.note)
+            if status is not None and status.state == "streaming" and serial not in self._streams:
+                raise ModuleLost(serial, "it follows set-points of another program, which has its secret")
 
     def _status_under_lease(self, serial: str) -> Status | None:
         """Return the status; None before the lease, as it may report an earlier stop or expiry."""
@@ -349,6 +353,7 @@ class ModuleGroup:
         """Send one set-point, which is not acknowledged; None switches a loop off."""
         # The set-point replaces the last motion, which must not be commanded again.
         self._running.pop(serial, None)
+        self._streams.add(serial)
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
         self._messenger.publish(serial, Leaf.SETPOINT, self._command(Setpoint, serial, **point), self._secret)
 

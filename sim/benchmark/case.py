@@ -1,5 +1,6 @@
 """The parts of a benchmark: cases, their trials, and the rows computed from the trials' results."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -15,12 +16,14 @@ class Trial(NamedTuple):
     cost_s: approximate duration; long trials start first, so that all processes end together.
     shares: trials of the same name run one after the other in one process, which keeps what they have in
         common; none by default.
+    limit_s: after this time it is given up, and counts as failed; a cluster has no such limit.
     """
 
     work: Callable[..., Any]
     arguments: tuple[Any, ...]
     cost_s: float = 1.0
     shares: str = ""
+    limit_s: float = math.inf
 
 
 class Failed(NamedTuple):

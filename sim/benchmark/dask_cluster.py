@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from module_agent.model.errors import LostError, UsageError
-from sim.benchmark.case import Trial
+from module_agent.model.errors import UsageError
+from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trial
 
 CONNECT_S = 10.0
@@ -15,11 +15,11 @@ def run_trials_on(
 ) -> list[Any]:
     """Run trials on the cluster of a Dask scheduler and return their results in order.
 
-    `on_done` receives index and result of each as it ends. A trial that raises gives `Failed`.
+    `on_done` receives index and result of each as it ends. A trial that raises, or whose workers the cluster
+    loses again and again, gives `Failed`.
 
     Raises:
         UsageError: the library is not installed, or no scheduler is at the address.
-        LostError: the cluster has lost a trial's worker too often, or itself.
     """
     try:
         from distributed import Client, as_completed
@@ -36,8 +36,9 @@ def run_trials_on(
         results: list[Any] = [None] * len(trials)
         for future in as_completed(futures):  # type: ignore[no-untyped-call]
             index = place[future.key]
-            if future.status != "finished":
-                raise LostError(f"the cluster at {address} lost trial {index}: {future.exception()}")
-            results[index] = future.result()
+            if future.status == "finished":
+                results[index] = future.result()
+            else:
+                results[index] = Failed(f"the cluster at {address} lost it: {future.exception()}")
             on_done(index, results[index])
         return results

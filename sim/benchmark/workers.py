@@ -1,9 +1,11 @@
 """The runner of all experiments: trials in worker processes, and the cases of a benchmark on top of it.
 
 A process grows by tens of megabytes with every virtual run, so each is replaced after some minutes. A process
-that dies is replaced too, and its trial counts as failed. The trials of all cases are mixed.
+that dies is replaced too, as is one whose trial does not end; that trial counts as failed. The trials of all
+cases are mixed.
 """
 
+import math
 import multiprocessing
 import signal
 import tempfile
@@ -76,18 +78,27 @@ def _team(size: int) -> Iterator[list["_Worker"]]:
 
 def _finished(team: Sequence["_Worker"]) -> Iterator[tuple[int, Done]]:
     busy = {worker.pipe: worker for worker in team if worker.busy}
-    for pipe in wait(list(busy)):
+    until_s = min(worker.until_s for worker in busy.values())
+    for pipe in wait(list(busy), None if until_s == math.inf else max(until_s - time.monotonic(), 0.0)):
         if isinstance(pipe, Connection):
             yield busy[pipe].finish()
+    for worker in team:
+        if worker.busy and time.monotonic() > worker.until_s:
+            yield worker.give_up()
 
 
 class _Worker:
-    """One process at a time, the pipe to it, and the trials that must be its next ones."""
+    """One process at a time, the pipe to it, and the trials that must be its next ones.
+
+    until_s: when the present trial is to have ended, by the monotonic clock.
+    """
 
     def __init__(self, folder: str):
         self.next: list[int] = []
+        self.until_s = math.inf
         self._folder = folder
         self._left_s = 0.0
+        self._limit_s = math.inf
         self._index: int | None = None
         self._process: BaseProcess | None = None
         self.pipe: Connection
@@ -101,7 +112,8 @@ class _Worker:
         """Hand over a trial, to a new process if there is none."""
         if self._process is None or not self._process.is_alive():
             self._start()
-        self._index = index
+        self._index, self._limit_s = index, trial.limit_s
+        self.until_s = time.monotonic() + trial.limit_s
         self._left_s -= trial.cost_s
         self.pipe.send(trial)
 
@@ -117,6 +129,13 @@ class _Worker:
         if self._left_s <= 0.0 and not self.next:
             self.end()
         return index, found
+
+    def give_up(self) -> tuple[int, Done]:
+        """End a process whose trial does not end; return the trial's index and that it failed."""
+        self.end()
+        index, self._index = self._index, None
+        assert index is not None
+        return index, Done(Failed(f"it hangs: it had not ended after {self._limit_s:g} s"), 0.0)
 
     def end(self) -> None:
         """End the process, at once if it is at work."""

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -18,10 +19,14 @@ from sim.commands.options import load
 from sim.faults.fault import Fault, fault_of
 from sim.faults.report import OUTCOMES, SeedReport, by_fault, run_seed
 from sim.faults.schedule import Schedule, draw, first_modules
+from sim.thesis.experiment import Unit
+from sim.thesis.study import Store, key
 
 _RANGE = re.compile(r"(\d{1,12})\.\.(\d{1,12})\Z")
 # Processor time of a seed [s].
 COST_S = 1.0
+# A seed that has not ended by then, its simpler sessions included, hangs: a busy machine takes a minute [s].
+HANG_S = 900.0
 
 
 def faults(
@@ -43,6 +48,10 @@ def faults(
     dask: Annotated[
         str | None, typer.Option(help="A Dask scheduler to work on instead, such as tcp://10.0.0.5:8786.")
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder in which seeds are kept that are over: the same command continues."),
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Run sessions with faults in virtual time and judge them by the truth of the plant.
@@ -51,8 +60,10 @@ def faults(
     """
     numbers = seed_range(seeds)
     schedules = [_schedule(seed, robot, modules, network, fault) for seed in numbers]
-    trials = [Trial(run_seed, (schedule, shrink), COST_S) for schedule in schedules]
-    outcomes = _run(trials, workers, dask)
+    units = [
+        Unit(f"seed {one.seed}", run_seed, (one, shrink), kind=SeedReport, cost_s=COST_S) for one in schedules
+    ]
+    outcomes = _run(units, None if out is None else Store(out), workers, dask)
     reports = [one for one in outcomes if isinstance(one, SeedReport)]
     if write_result(json_file, figures(numbers, outcomes)):
         _print_table(reports)
@@ -137,22 +148,36 @@ def _of_robot(fault: Fault, schedule: Schedule) -> Fault:
     return fault
 
 
-def _run(trials: list[Trial], workers: int | None, dask: str | None) -> list[Any]:
-    done = 0
-    with experiment() as terminal:
+def _run(units: Sequence[Unit], store: Store | None, workers: int | None, dask: str | None) -> list[Any]:
+    """Return the outcome of each unit; those that the store has are not run again."""
+    names = ["" if store is None else key(unit) for unit in units]
+    outcomes = [None if store is None else store.load(*one) for one in zip(names, units, strict=True)]
+    missing = [index for index, outcome in enumerate(outcomes) if outcome is None]
+    done = len(units) - len(missing)
+    kept = "nothing is written" if store is None else "what is over is kept: the same command continues"
+    with experiment(kept) as terminal:
 
-        def show(index: int, result: Any) -> None:
+        def show(number: int, result: Any) -> None:
             nonlocal done
             done += 1
-            terminal.step(done, len(trials), f"seed {trials[index].arguments[0].seed}")
+            index = missing[number]
+            outcomes[index] = result
+            if store is not None and not isinstance(result, Failed):
+                store.keep(names[index], units[index], result)
+            terminal.step(done, len(units), units[index].name)
 
+        trials = [Trial(run_seed, units[index].arguments, COST_S, limit_s=HANG_S) for index in missing]
         if dask is not None:
-            return run_trials_on(dask, trials, show)
-        return [each.result for each in run_trials(trials, worker_count(workers), show)]
+            run_trials_on(dask, trials, show)
+        else:
+            run_trials(trials, worker_count(workers), show)
+    return outcomes
 
 
 def _print_table(reports: list[SeedReport]) -> None:
     table = new_table("Outcomes by fault", " | ".join(("fault", *(f">{one}" for one in OUTCOMES))))
     for kind, counted in by_fault(reports).items():
+        if not counted:
+            continue
         table.add_row(kind, *(str(counted[one]) for one in OUTCOMES))
     print_table(table)

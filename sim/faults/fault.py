@@ -6,14 +6,17 @@ from typing import Literal, NamedTuple
 
 from module_agent.model.errors import UsageError
 
-Part = Literal["agent", "coordinator", "clock", "encoder", "imu", "torque", "motor", "network", "disk"]
+Part = Literal[
+    "agent", "coordinator", "holder", "clock", "encoder", "imu", "torque", "motor", "network", "disk"
+]
 
 
 class Nature(NamedTuple):
     """What a kind of fault happens to, and how.
 
     ends: a fault that is over after a time; "never" lasts to the end of the session, "either" is drawn.
-    words: one of them, in any case, is in a sentence that names the fault; () where the module's serial does.
+    words: one of them, in any case and number, is in a sentence that names the fault; one that ends with *
+        may begin a longer word. () where the module's serial names it.
     """
 
     part: Part
@@ -22,7 +25,7 @@ class Nature(NamedTuple):
 
 
 _NETWORK = (
-    "answer",
+    "answer*",
     "network",
     "slow",
     "late",
@@ -34,9 +37,9 @@ _NETWORK = (
     "expected, found",
 )
 _TIME = ("clock", "time", "expired", "lease")
-_POSITION = ("position", "velocity", "encoder", "moved", "turn")
-_IMU = ("gyro", "accel", "imu", "specific force", "gravity")
-_TORQUE = ("effort", "torque")
+_POSITION = ("position", "velocit*", "encoder", "move*", "turn*")
+_IMU = ("gyro*", "accel*", "imu", "specific force", "gravity")
+_TORQUE = ("effort*", "torque")
 
 NATURES: dict[str, Nature] = {
     "agent crash": Nature("agent", "never"),
@@ -47,8 +50,11 @@ NATURES: dict[str, Nature] = {
     "hot plug": Nature("agent", "never"),
     "hot unplug": Nature("agent", "never"),
     "coordinator crash": Nature("coordinator", "never"),
-    "coordinator freeze": Nature("coordinator", "after", ("expired", "lease", "answer", "lost", "slow")),
-    "coordinator restart": Nature("coordinator", "never"),
+    "coordinator freeze": Nature("coordinator", "after", ("expired", "lease", "answer*", "lost", "slow")),
+    "coordinator restart": Nature("coordinator", "never", ("lease", "held", "resume*")),
+    "reckless holder": Nature(
+        "holder", "after", ("gain", "busy", "move*", "motion", "set-point", "setpoint", "lease")
+    ),
     "clock forward": Nature("clock", "never", _TIME),
     "clock back": Nature("clock", "never", _TIME),
     "clock stuck": Nature("clock", "after", _TIME),
@@ -63,18 +69,18 @@ NATURES: dict[str, Nature] = {
     "IMU swapped": Nature("imu", "never", _IMU),
     "torque stuck": Nature("torque", "either", _TORQUE),
     "torque NaN": Nature("torque", "either", _TORQUE),
-    "motor stall": Nature("motor", "either", ("moved", "motion", "stall", "follow")),
+    "motor stall": Nature("motor", "either", ("move*", "motion", "stall*", "follow*")),
     "overheating": Nature("motor", "never", ("winding", "temperature")),
-    "voltage sag": Nature("motor", "after", ("voltage", "moved", "motion", "follow")),
+    "voltage sag": Nature("motor", "after", ("voltage", "move*", "motion", "follow*")),
     "partition": Nature("network", "after", _NETWORK),
     "corrupted messages": Nature("network", "after", _NETWORK),
     "duplicated messages": Nature("network", "after", _NETWORK),
     "delayed messages": Nature("network", "after", _NETWORK),
     "intruder": Nature("network", "after", (*_NETWORK, "GHOST")),
-    "disk full": Nature("disk", "after", ("disk", "space", "file", "write")),
+    "disk full": Nature("disk", "after", ("disk", "space", "file", "writ*")),
 }
 KINDS = tuple(NATURES)
-OF_A_MODULE: tuple[Part, ...] = ("agent", "clock", "encoder", "imu", "torque", "motor")
+OF_A_MODULE: tuple[Part, ...] = ("agent", "holder", "clock", "encoder", "imu", "torque", "motor")
 
 _TEXT = re.compile(
     r"(?P<kind>.+?)(?: of module (?P<module>\d{1,3}))? "
@@ -123,19 +129,26 @@ class Fault(NamedTuple):
 
     def is_named(self, text: str, serials: tuple[str, ...]) -> bool:
         """Return whether a sentence names this fault: its words, and its module where it has one."""
-        said = text.lower()
-        words = not self.nature.words or any(word.lower() in said for word in self.nature.words)
         # How many modules are missing, and which are there, names those that are not.
+        counts = self.nature.part == "agent" and "expected, found" in text
         sick = [serials[index] for index in self.modules(len(serials))]
-        named = any(s in text for s in sick) or (self.nature.part == "agent" and "expected, found" in said)
-        return words and (named or not self.of_a_module)
+        module = counts or any(re.search(rf"(?<!\w){re.escape(serial)}(?!\w)", text) for serial in sick)
+        if not self.nature.words:
+            return module
+        return (module or not self.of_a_module) and any(_has(text, word) for word in self.nature.words)
+
+
+def _has(text: str, word: str) -> bool:
+    """Return whether a text has a word, or its plural; with * at its end, a word that begins with it."""
+    end = "" if word.endswith("*") else r"s?\b"
+    return re.search(rf"\b{re.escape(word.removesuffix('*'))}{end}", text, re.IGNORECASE) is not None
 
 
 def fault_of(text: str) -> Fault:
     """Return the fault that `str` of it describes.
 
     Raises:
-        UsageError: another text, or no such kind.
+        UsageError: another text, no such kind, or one that never ends and does, or the other way about.
     """
     match = _TEXT.match(text)
     if match is None or match["kind"] not in NATURES:
@@ -143,6 +156,10 @@ def fault_of(text: str) -> Fault:
             f"fault {text!r}: expected KIND [of module N] (at S s for S s | from S s on), size X with three "
             f"decimals, such as {Fault('agent thaw', 4.2, 0.5, 1)}; kinds are {', '.join(KINDS)}"
         )
+    ends = NATURES[match["kind"]].ends
+    if (ends == "after" and match["since"]) or (ends == "never" and match["lasts"]):
+        said = "ends: at S s for S s" if ends == "after" else "does not end: from S s on"
+        raise UsageError(f"fault {text!r}: {match['kind']} {said}")
     at_s = float(match["at"] or match["since"])
     for_s = float(match["lasts"]) if match["lasts"] else math.inf
     return Fault(match["kind"], at_s, for_s, int(match["module"] or 0), float(match["size"]))

@@ -23,7 +23,12 @@ _REMEMBERED = 16
 
 
 class Intruder:
-    """Attacks one module in one way, a few packets a call; `number` of `ATTACKS` says which."""
+    """Attacks one module in one way, a few packets a call; `attack` is the number of it in `ATTACKS`.
+
+    period_s: how often it is to strike.
+    """
+
+    period_s = 0.02
 
     def __init__(self, transport: Transport, robot: str, serial: str, attack: int, seed: int):
         self._transport = transport

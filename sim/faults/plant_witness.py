@@ -3,7 +3,8 @@
 The witness sees the plant and the bytes on the wire, and neither the firmware's state nor its opinion.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +16,11 @@ from module_agent.wire.keys import KeyParts, Leaf, parse
 from module_agent.wire.messages import Ack, LeaseRequest
 from module_agent.wire.refusal import WireError
 from sim.geometry.pose import Array
+from sim.virtual_time.loop import NS_PER_S
 from sim.virtual_time.quiet_run import ASKED
 from sim.virtual_time.robot import VirtualRobot
 from sim.world.world import TICK_NS
-from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM
+from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM, Q_RAD, QD_RAD_S
 
 LIFETIME_NS = 250_000_000
 COMMANDS = (Leaf.LEASE, Leaf.MOTION, Leaf.SETPOINT, Leaf.GAINS)
@@ -27,6 +29,9 @@ SLOW_RAD_S = 0.05
 # Of a motor, seen at the output, over the speed of its type: loops overshoot their clamps. The output swings
 # about that speed on its spring.
 SPEED_MARGIN = 1.25
+# How far a motor may drive its joint on beyond a limit of its position: what the encoder errs by, and a joint
+# that is led back against its load is let down and pushed again. The way that braking takes is no driving.
+OUTWARD_RAD = 0.02
 # Ticks between looks at the motors' speeds, which change within tens of milliseconds.
 SPEED_TICKS = 8
 # A PWM at 48 V; no command of a module may be larger.
@@ -52,12 +57,18 @@ class PlantWitness:
     """Notes violations by the motors: `violations` maps each kind to the first case of it, as a sentence.
 
     Args:
-        commanders: the names of endpoints on the network that may command.
+        commanders: the names of endpoints on the network that may command, and in whose name each does.
+        ranges: the configured range of position of each module that is to keep it, by serial [rad].
     """
 
-    def __init__(self, commanders: Iterable[str]) -> None:
+    def __init__(
+        self, commanders: Mapping[str, str], ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    ) -> None:
         self.violations: dict[str, str] = {}
-        self._commanders = frozenset(commanders)
+        self._commanders = commanders
+        self._ranges = ranges
+        # How far each joint has been driven on since it left its range.
+        self._outward_rad = dict.fromkeys(ranges, 0.0)
         self._sent_ns: dict[str, int] = {}
         self._accepted_ns: dict[str, int] = {}
         self._stopped: set[str] = set()
@@ -110,7 +121,7 @@ class PlantWitness:
         except WireError:
             return
         # A copy of a request is no request of who copied it.
-        asked = _Request(endpoint, request.action == "acquire")
+        asked = _Request(self._commanders.get(endpoint, endpoint), request.action == "acquire")
         self._requests.setdefault((serial, request.sender, request.seq), asked)
 
     def check(self, robot: VirtualRobot, seen: Array) -> None:
@@ -121,6 +132,7 @@ class PlantWitness:
         if first_look < len(seen):
             looked_ns = first_ns + first_look * TICK_NS
             self._check_speeds(robot, looked_ns, seen[first_look::SPEED_TICKS, PLANT_MOTOR_RAD_S])
+        self._check_positions(robot.serials, first_ns, seen)
         for k, serial in enumerate(robot.serials):
             commanded_ns = min(
                 self._sent_ns.get(serial, -LIFETIME_NS), self._accepted_ns.get(serial, -LIFETIME_NS)
@@ -154,6 +166,35 @@ class PlantWitness:
         at_s = (first_ns + (tick * SPEED_TICKS + 1) * TICK_NS) / 1e9
         text = f"module {robot.serials[k]} at {at_s:.3f} s: {speeds[tick, k]:.2f} rad/s of {limits[k]:.2f}"
         self._note("speed beyond the limit", text)
+
+    def _check_positions(self, serials: Sequence[str], first_ns: int, seen: Array) -> None:
+        """Judge where the motors drive their joints, in the ticks (T, rows, n).
+
+        A load may carry a joint beyond its limit, and so does its speed where it cannot brake in time. What
+        no motor may do is push a joint on that is there already.
+        """
+        for serial, (low, high) in self._ranges.items():
+            k = serials.index(serial)
+            q = seen[:, Q_RAD, k]
+            if low <= q.min() and q.max() <= high:
+                self._outward_rad[serial] = 0.0
+                continue
+            out = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))
+            speed = out * seen[:, QD_RAD_S, k]
+            driven = (out * seen[:, PLANT_PWM, k] > 0.0) & (speed > 0.0)
+            steps = np.where(driven, speed * (TICK_NS / NS_PER_S), 0.0)
+            ways = np.cumsum(steps)
+            # The way begins anew within the range; before these ticks it may have begun already.
+            ways -= np.maximum.accumulate(np.where(out == 0.0, ways, -self._outward_rad[serial]))
+            self._outward_rad[serial] = float(ways[-1])
+            farthest = int(np.argmax(ways))
+            if ways[farthest] > OUTWARD_RAD:
+                at_s = (first_ns + (farthest + 1) * TICK_NS) / NS_PER_S
+                text = (
+                    f"module {serial} at {at_s:.3f} s: driven on by {ways[farthest]:.3f} rad beyond "
+                    f"{low:.3f} .. {high:.3f} rad, to {q[farthest]:.3f} rad"
+                )
+                self._note("driven beyond its range", text)
 
     def _check_off(self, serial: str, t_ns: int, ended_ns: int, pwm: float, speed: float) -> None:
         """Judge a motor that is commanded no more: off, or braking after a stop."""

@@ -9,8 +9,7 @@ from typing import Literal, NamedTuple, get_args
 from module_agent.model.errors import RobotError
 from sim.faults.fault import KINDS
 from sim.faults.invariants import check_folder, is_misnamed
-from sim.faults.plant_witness import PlantWitness
-from sim.faults.run import COORDINATOR, SUCCESSOR, Ending, run_schedule
+from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import Schedule, simpler
 
 Outcome = Literal["right", "suspect", "named", "misnamed", "stopped", "violation"]
@@ -27,7 +26,7 @@ class SeedReport(NamedTuple):
     outcome: the right robot with exit code 0, a result called suspect, an error that names what
     may have happened, one that accuses a healthy module, stopped with its coordinator killed, or a violation
     of an invariant.
-    named_rightly: whether an error or a suspicion names a fault of the schedule, None without either.
+    named_rightly: whether an error or a suspicion names a fault that had begun, None without either.
     simplest: the simplest session found that violates the same invariant, None if none was looked for.
     """
 
@@ -62,7 +61,7 @@ def run_seed(schedule: Schedule, shrinks: bool = True) -> SeedReport:
 
 
 def _judged(schedule: Schedule) -> SeedReport:
-    witness = PlantWitness((COORDINATOR, SUCCESSOR))
+    witness = witness_of(schedule)
     violations: dict[str, str] = {}
     with TemporaryDirectory(prefix="x5-faults-") as folder:
         try:
@@ -77,7 +76,8 @@ def _judged(schedule: Schedule) -> SeedReport:
         violations |= witness.violations | check_folder(Path(folder) / "run", ending)
     outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
     serials = schedule.robot.serials
-    named = any(fault.is_named(ending.text, serials) for fault in schedule.faults)
+    begun = [fault for fault in schedule.faults if fault.at_s <= ending.at_s]
+    named = any(fault.is_named(ending.text, serials) for fault in begun)
     return SeedReport(
         seed=schedule.seed,
         robot=schedule.robot.name,

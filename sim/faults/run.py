@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import resource
 from collections.abc import Callable
 from functools import partial
@@ -13,6 +14,8 @@ from coordinator.live_robot.messenger import Sender
 from coordinator.recording.run_folder import RESULT, SESSION
 from coordinator.runtime.event_loop import end_tasks
 from coordinator.session.run import Run, RunConfig
+from module_agent.control.safety import Safety
+from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network
 from module_agent.wire.keys import parse
@@ -20,7 +23,8 @@ from sim.faults.fault import Fault
 from sim.faults.faulty_robot import BEGINNINGS, FaultyRobot
 from sim.faults.intruder import ATTACKS, OVERHEARD, Intruder
 from sim.faults.plant_witness import PlantWitness
-from sim.faults.schedule import Schedule
+from sim.faults.reckless_holder import RecklessHolder, Target
+from sim.faults.schedule import Schedule, position_ranges
 from sim.virtual_time.cable import Cable, CableState
 from sim.virtual_time.loop import NS_PER_S, VirtualLoop
 from sim.virtual_time.network import Tap, VirtualNetwork
@@ -28,7 +32,8 @@ from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.run import QUICK_PLAN, SilentScreen
 from sim.world.truth import write_truth
 
-COORDINATOR, SUCCESSOR = "coordinator", "successor"
+COORDINATOR, SUCCESSOR, RECKLESS = "coordinator", "successor", "reckless holder"
+SECRET = b"a-secret-of-16-b"
 # Four joints take 30 s; every motion may be repeated twice, and a run be resumed.
 LIMIT_S = 180.0
 # How long motors are observed after the coordinator has ended: several lifetimes.
@@ -37,19 +42,18 @@ AFTERWARDS_S = 1.0
 DELAY_S = 0.1
 # When a coordinator that was killed is started again, its lease of the modules has lapsed.
 RESTART_S = 2.0
-# How often an intruder strikes.
-STRIKE_S = 0.02
 
 
 class Ending(NamedTuple):
     """How a session ended: `result`, `suspect`, `lost`, `unbounded`, or by the name of an error.
 
     suspect: a result that its program does not believe as usual, by exit code 5; the text says why. lost: its
-    coordinator was killed.
+    coordinator was killed. at_s: when it ended.
     """
 
     name: str
     text: str = ""
+    at_s: float = math.inf
 
 
 class _Killed(BaseException):
@@ -58,6 +62,23 @@ class _Killed(BaseException):
 
 class _OutOfTime(BaseException):
     """The session has not ended within `LIMIT_S`."""
+
+
+def witness_of(schedule: Schedule) -> PlantWitness:
+    """Return who is to observe the session of a schedule."""
+    faults, serials = schedule.faults, schedule.robot.serials
+    reckless = [_reckless(fault) for fault in faults if fault.kind == "reckless holder"]
+    # A range is that of the module's own encoder.
+    blind = {serials[fault.module] for fault in faults if fault.nature.part == "encoder"}
+    ranges = {serial: ends for serial, ends in position_ranges(schedule).items() if serial not in blind}
+    return PlantWitness(
+        {name: name for name in (COORDINATOR, SUCCESSOR)} | dict.fromkeys(reckless, COORDINATOR), ranges
+    )
+
+
+def _reckless(fault: Fault) -> str:
+    """Return the name of the endpoint of a reckless holder."""
+    return f"{RECKLESS} {fault.module} {fault.at_s}"
 
 
 def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending:
@@ -72,7 +93,8 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
         for each in taps:
             each(now_ns, endpoint, kind, key, payload)
 
-    settings = VirtualSettings(schedule.robot, network(schedule.network), schedule.seed, "x5")
+    safety = {s: Safety(position_rad=range_rad) for s, range_rad in position_ranges(schedule).items()}
+    settings = VirtualSettings(schedule.robot, network(schedule.network), schedule.seed, "x5", safety=safety)
     robot = FaultyRobot(settings, loop, VirtualNetwork(loop, tap), schedule.faults)
     session = _Session(schedule, robot, out, taps)
     robot.on_run.append(partial(witness.check, robot))
@@ -98,7 +120,7 @@ class _Session:
         self._sender = COORDINATOR
         self._restarts = False
         self._full = 0
-        self._intruders: dict[Fault, Intruder] = {}
+        self._strikers: dict[Fault, Intruder | RecklessHolder] = {}
         self._over = False
 
     def run(self) -> Ending:
@@ -107,12 +129,15 @@ class _Session:
         for fault in self._schedule.faults:
             if fault.kind == "intruder":
                 self._await_intruder(fault)
+            elif fault.kind == "reckless holder":
+                self._await_reckless(fault)
             loop.schedule_ns(round(fault.at_s * NS_PER_S), partial(self._begin, fault))
         loop.schedule_ns(round(LIMIT_S * NS_PER_S), self._end_of_time)
         ending = self._coordinate(resume=False)
         if ending.name == "lost" and self._restarts:
             self._sender = SUCCESSOR
             ending = self._coordinate(resume=True)
+        ending = ending._replace(at_s=loop.now_ns / NS_PER_S)
         self._over = True
         if ending.name != "unbounded":
             self._wait(AFTERWARDS_S)
@@ -126,7 +151,7 @@ class _Session:
         config = RunConfig(
             robot=robot.robot.name,
             out=self._out,
-            sender=Sender(self._sender, b"a-secret-of-16-b"),
+            sender=Sender(self._sender, SECRET),
             plan=QUICK_PLAN,
             expect=len(robot.serials),
             resume=resume,
@@ -183,7 +208,8 @@ class _Session:
             "coordinator crash": self._kill,
             "coordinator restart": self._restart,
             "coordinator freeze": self._freeze,
-            "intruder": self._intrude,
+            "intruder": self._strike,
+            "reckless holder": self._strike,
             "disk full": self._fill_disk,
         }
         part = fault.nature.part
@@ -239,18 +265,26 @@ class _Session:
                 intruder.overhear(leaf, payload)
 
         self._taps.append(overhear)
-        self._intruders[fault] = intruder
+        self._strikers[fault] = intruder
 
-    def _intrude(self, fault: Fault) -> None:
-        loop, intruder = self._robot.loop, self._intruders[fault]
+    def _await_reckless(self, fault: Fault) -> None:
+        """Let a second program with the coordinator's name and secret hear the module to be commanded."""
+        robot, module = self._robot.robot, self._robot.robot.modules[fault.module]
+        range_rad = position_ranges(self._schedule)[module.serial]
+        target = Target(robot.name, module.serial, module_type(module.type), range_rad)
+        endpoint, sender = self._robot.endpoint(_reckless(fault)), Sender(COORDINATOR, SECRET)
+        self._strikers[fault] = RecklessHolder(endpoint, target, sender, fault.size)
+
+    def _strike(self, fault: Fault) -> None:
+        loop, striker = self._robot.loop, self._strikers[fault]
         until_ns = loop.now_ns + round(fault.for_s * NS_PER_S)
 
         def strike() -> None:
-            if self._over or loop.now_ns >= until_ns:
-                intruder.close()
+            if loop.now_ns >= until_ns:
+                striker.close()
             else:
-                intruder.strike()
-                self._later(STRIKE_S, strike)
+                striker.strike()
+                self._later(striker.period_s, strike)
 
         strike()
 

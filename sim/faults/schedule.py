@@ -28,6 +28,9 @@ NETWORKS = ("none", "lan", "wifi")
 # A session of two joints takes 15 s; a fault after its end is none.
 LATEST_S = 14.0
 SHORTEST_S, LONGEST_S = 0.02, 1.5
+# From where a joint begins to the limits of its position, at the least and at the most: the motions of a
+# short session go to half a radian, and near a limit they would be slowed down.
+ROOM_RAD = (0.8, 1.4)
 
 
 class Schedule(NamedTuple):
@@ -51,6 +54,18 @@ def draw(seed: int, robot: Robot | None = None) -> Schedule:
     count = int(_stream(seed, "count").choice((1, 2, 3), p=(0.6, 0.3, 0.1)))
     faults = [_fault(seed, number, len(drawn.modules)) for number in range(count)]
     return Schedule(seed, drawn, network, tuple(sorted(faults, key=lambda fault: fault.at_s)))
+
+
+def position_ranges(schedule: Schedule) -> dict[str, tuple[float, float]]:
+    """Return the range [rad] that each module of the session is configured to stay in, by serial.
+
+    It begins within it, and what a session plans has room.
+    """
+    ranges = {}
+    for module in schedule.robot.modules:
+        low, high = _stream(schedule.seed, module.serial, "range").uniform(*ROOM_RAD, 2).tolist()
+        ranges[module.serial] = (round(module.start_rad - low, 3), round(module.start_rad + high, 3))
+    return ranges
 
 
 def first_modules(robot: Robot, modules: int) -> Robot:

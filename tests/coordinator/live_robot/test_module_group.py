@@ -13,7 +13,7 @@ from coordinator.live_robot.module_group import ModuleGroup
 from module_agent.control.motion import effort_profile
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.wire.keys import Leaf
-from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest
+from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest, Setpoint
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -310,6 +310,30 @@ def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Ca
 
     assert rig.run(work()) == [TIP]
     assert rig.state(BASE) == "stopped"
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_set_points_of_another_program_with_the_secret_are_named(rigs: Callable[..., Any], own: bool) -> None:
+    rig = rigs(ARM, "lan")
+    messenger, _, group = rig.group()
+
+    async def work() -> None:
+        keeper = await _armed(group)
+        for _ in range(10):
+            if own:
+                group.stream(BASE, None, 0.2, None)
+            else:
+                aims = {"position_rad": None, "velocity_rad_s": 0.2, "effort_nm": None}
+                messenger.publish(BASE, Leaf.SETPOINT, group._command(Setpoint, BASE, **aims), group._secret)
+            await asyncio.sleep(0.02)
+        keeper.cancel()
+        group.check()
+
+    if own:
+        rig.run(work())
+    else:
+        with pytest.raises(ModuleLost, match=f"module {BASE} is lost: it follows set-points of another"):
+            rig.run(work())
 
 
 def test_lost_feedback_and_estimates_are_fetched(rigs: Callable[..., Any]) -> None:

@@ -47,6 +47,12 @@ def test_a_worker_that_dies_takes_its_trial_along_and_is_replaced() -> None:
     assert second == 2.0
 
 
+def test_a_trial_that_hangs_is_given_up_and_the_others_go_on() -> None:
+    trials = [Trial(time.sleep, (3600.0,), limit_s=0.5), Trial(math.sqrt, (4.0,))]
+    assert results(trials, 1) == [Failed("it hangs: it had not ended after 0.5 s"), 2.0]
+    assert not multiprocessing.active_children()
+
+
 def test_a_result_that_cannot_be_sent_is_a_trial_that_failed() -> None:
     (found,) = results([Trial(memoryview, (b"",))], 1)
     assert isinstance(found, Failed)

@@ -2,12 +2,16 @@
 
 import json
 import shlex
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
-from module_agent.model.errors import EXIT_FINDING, EXIT_USAGE
+from module_agent.model.errors import EXIT_FINDING, EXIT_INTERRUPTED, EXIT_USAGE
+from sim.benchmark.case import Trial
+from sim.benchmark.workers import run_trial
 from sim.commands import faults
 from sim.faults import report
 from sim.faults.plant_witness import PlantWitness
@@ -28,16 +32,19 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(report, "run_schedule", run_schedule)
     monkeypatch.setattr(report, "check_folder", lambda out, ending: {})
-    monkeypatch.setattr(
-        faults, "_run", lambda trials, workers, dask: [trial.work(*trial.arguments) for trial in trials]
-    )
+    monkeypatch.setattr(faults, "run_trials", one_after_another)
+
+
+def one_after_another(trials: list[Trial], workers: int, on_done: Callable[[int, Any], None]) -> None:
+    for index, trial in enumerate(trials):
+        on_done(index, run_trial(trial))
 
 
 @pytest.mark.usefixtures("in_this_process")
 def test_a_violation_is_made_simpler_and_its_command_repeats_it(tmp_path: Path) -> None:
-    # Seed 8: three modules, two faults, one of them an agent that boots.
+    # Seed 15: four modules, two faults, one of them an agent that boots.
     runner, document = CliRunner(), tmp_path / "faults.json"
-    options = ["faults", "--seeds", "8..8", "--json", str(document)]
+    options = ["faults", "--seeds", "15..15", "--json", str(document)]
     found = runner.invoke(app, options)
     assert found.exit_code == EXIT_FINDING
     assert "driven too late: module X at 1.000 s" in found.output
@@ -64,11 +71,41 @@ def test_seeds_without_violation_end_with_zero() -> None:
     assert "1 seeds, 0 with violations" in found.output
 
 
+@pytest.mark.usefixtures("in_this_process")
+def test_seeds_that_are_over_are_kept_and_not_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[int] = []
+
+    def interrupted(trials: list[Trial], workers: int, on_done: Callable[[int, Any], None]) -> None:
+        for index, trial in enumerate(trials):
+            begun.append(trial.arguments[0].seed)
+            if begun == [1, 2, 3]:
+                raise KeyboardInterrupt
+            on_done(index, run_trial(trial))
+
+    monkeypatch.setattr(faults, "run_trials", interrupted)
+    command = ["faults", "--seeds", "1..4", "--out", str(tmp_path), "--json", str(tmp_path / "faults.json")]
+    first = CliRunner().invoke(app, command)
+    assert first.exit_code == EXIT_INTERRUPTED
+    assert "the same command continues" in first.output
+    second = CliRunner().invoke(app, command)
+    assert begun == [1, 2, 3, 3, 4]
+    assert second.exit_code == EXIT_FINDING
+    assert "4 seeds, 2 with violations" in second.output
+    # What was kept is what one run of all of them gives, simpler sessions included.
+    kept = json.loads((tmp_path / "faults.json").read_text())
+    monkeypatch.setattr(faults, "run_trials", one_after_another)
+    assert CliRunner().invoke(app, [*command[:3], *command[5:]]).exit_code == EXIT_FINDING
+    assert kept == json.loads((tmp_path / "faults.json").read_text())
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (("--seeds", "9"), "expected A..B"),
         (("--seeds", "1..1", "--fault", "thunder"), "expected KIND"),
+        (("--seeds", "1..1", "--fault", "partition from 1.000 s on, size 0.500"), "ends: at S s for S s"),
         (
             ("--seeds", "3..3", "--fault", "agent crash of module 5 from 1.000 s on, size 0.500"),
             "has modules 0 to 1",
@@ -86,4 +123,4 @@ def test_wrong_usage_is_answered_with_what_is_right(options: tuple[str, ...], wo
 
 def test_a_seed_gives_the_same_report_twice() -> None:
     # An agent freezes early: the session is short.
-    assert run_seed(draw(94)) == run_seed(draw(94))
+    assert run_seed(draw(289)) == run_seed(draw(289))

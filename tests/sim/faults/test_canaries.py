@@ -15,6 +15,7 @@ from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.session_file import SessionWriter
 from coordinator.session.session import Session
 from module_agent.firmware.firmware import Answer, Firmware
+from module_agent.hardware import motor_guard
 from module_agent.hardware.motor_guard import MotorGuard
 from sim.faults import run
 from sim.faults.report import run_seed
@@ -28,18 +29,20 @@ def found(seed: int) -> dict[str, str]:
 # The coordinator of two joints is killed in mid motion, and not started again.
 KILLED = 89
 # An agent freezes before its joint was explored, which ends the session.
-FROZEN = 94
+FROZEN = 289
 # An intruder commands in the holder's name; later a torque sensor breaks, which ends the session.
 STOLEN = 81
 # Messages are corrupted while joints move.
 CORRUPTED = 10
+# A program with the holder's secret swings a joint at twice the speed of its type.
+RECKLESS = 68
 # Something holds a motor while its joint is to move, and lets it go.
 HELD = 39
 # Some messages arrive twice, which changes nothing.
 HARMLESS = 102
 
 
-@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN])
+@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS])
 def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
     assert found(seed) == {}
 
@@ -52,7 +55,22 @@ def test_firmware_that_does_not_expire_drives_too_late(monkeypatch: pytest.Monke
 
 def test_a_guard_that_does_not_limit_lets_too_much_pwm_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MotorGuard, "limit", lambda guard, pwm, sample: 100.0 * pwm)
-    assert "PWM out of range" in found(FROZEN)
+    assert "PWM out of range" in found(STOLEN)
+
+
+def test_a_guard_without_positions_lets_a_joint_be_driven_out_of_its_range(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(motor_guard._ACTIONS, "hold", motor_guard.FREE)
+    assert "driven beyond its range" in found(RECKLESS)
+
+
+def test_a_coordinator_with_a_defect_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def defect(serial: str, why: str) -> None:
+        raise KeyError(serial)
+
+    monkeypatch.setattr("coordinator.live_robot.errors.ModuleLost.__init__", lambda *_: defect("X", "y"))
+    assert set(found(FROZEN)) == {"traceback"}
 
 
 def test_a_module_that_takes_any_proof_gets_two_holders(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, LeaseRequest
 from sim.faults.plant_witness import LIFETIME_NS, PlantWitness
 from sim.virtual_time.quiet_run import ASKED, SEEN_ROWS
-from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM
+from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM, Q_RAD, QD_RAD_S
 
 ROBOT, SERIAL, HOLDER = "arm", "A", "coordinator"
 MS = 1_000_000
@@ -22,7 +22,7 @@ class Scene:
     """A coordinator and a module that talk, and what the witness finds long after that."""
 
     def __init__(self) -> None:
-        self.witness = PlantWitness([HOLDER])
+        self.witness = PlantWitness({HOLDER: HOLDER}, {SERIAL: (-1.0, 0.5)})
         self.now_ns = self._seq = 0
 
     def accept(self, leaf: Leaf, action: Literal["acquire", "renew"] | None = None) -> None:
@@ -119,3 +119,41 @@ def test_a_motor_may_be_driven_until_two_ticks_after_the_lifetime() -> None:
         seen[: last + 1, PLANT_PWM] = 0.3
         scene = armed()
         assert scene.looked(seen, scene.now_ns + LIFETIME_NS - 40 * MS) == found
+
+
+def outside(pwm: float, speed_rad_s: float, from_rad: float, ticks: int = 64) -> np.ndarray:
+    """Ticks of a joint that begins at a position and moves with a speed, its motor driven."""
+    seen = np.zeros((ticks, SEEN_ROWS, 1))
+    seen[:, Q_RAD, 0] = from_rad + 1e-3 * speed_rad_s * np.arange(ticks)
+    seen[:, QD_RAD_S], seen[:, PLANT_PWM], seen[:, ASKED] = speed_rad_s, pwm, pwm
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("seen", "kinds"),
+    [
+        # A load carries it on, its motor off or braking; it is led back; or it is driven within its range.
+        (outside(0.0, 2.0, 0.6), set()),
+        (outside(-0.3, 2.0, 0.6), set()),
+        (outside(-0.3, -2.0, 0.7), set()),
+        (outside(0.3, -2.0, 0.7), set()),
+        (outside(0.3, 2.0, 0.3), set()),
+        (outside(0.3, 2.0, 0.6), {"driven beyond its range"}),
+        (outside(-0.3, -2.0, -1.1), {"driven beyond its range"}),
+        # From within: of 126 mrad 26 are beyond the limit, or 16.
+        (outside(0.3, 2.0, 0.4), {"driven beyond its range"}),
+        (outside(0.3, 2.0, 0.39), set()),
+    ],
+)
+def test_no_motor_pushes_its_joint_on_beyond_its_range(seen: np.ndarray, kinds: set[str]) -> None:
+    scene = armed()
+    assert scene.looked(seen, scene.now_ns) == kinds
+
+
+def test_the_way_beyond_a_range_counts_from_call_to_call_and_begins_anew_within() -> None:
+    scene = armed()
+    for _ in range(3):
+        assert scene.looked(outside(0.3, 1.0, 0.6, ticks=16), scene.now_ns) == set()
+        assert scene.looked(outside(0.0, 0.0, 0.4, ticks=1), scene.now_ns) == set()
+    assert scene.looked(outside(0.3, 1.0, 0.6, ticks=16), scene.now_ns) == set()
+    assert scene.looked(outside(0.3, 1.0, 0.616, ticks=16), scene.now_ns) == {"driven beyond its range"}

@@ -42,7 +42,7 @@ def test_an_added_kind_changes_the_seeds_that_draw_it_and_no_others(
     changed = [before for before in drawn if draw(before.seed) != before]
     struck = [seed for seed in SEEDS if any(fault.kind == "lightning" for fault in draw(seed).faults)]
     assert [one.seed for one in changed] == struck
-    # A part in 34 of the faults, 1.5 a seed: 13 of 300, give or take four standard deviations.
+    # A part in 35 of the faults, 1.5 a seed: 13 of 300, give or take four standard deviations.
     assert 1 <= len(struck) <= 28
 
 
@@ -54,6 +54,44 @@ def test_a_fault_reads_back_from_its_text(drawn: Any) -> None:
     for text in ("", "agent crash", "thunder from 1.000 s on, size 0.500", "twin at 1 s for 1 s, size 1"):
         with pytest.raises(UsageError, match="expected KIND"):
             fault_of(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("partition from 1.000 s on, size 0.500", "partition ends: at S s for S s"),
+        ("agent crash of module 0 at 1.000 s for 0.500 s, size 0.500", "does not end: from S s on"),
+    ],
+)
+def test_a_fault_lasts_as_its_kind_does(text: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        fault_of(text)
+
+
+@pytest.mark.parametrize(
+    ("fault", "text", "named"),
+    [
+        (Fault("twin", 1.0, math.inf, 0), "A: the network is slow", False),
+        (Fault("twin", 1.0, math.inf, 0), "A answers under two boot ids", True),
+        (Fault("clock drift", 1.0, math.inf, 0), "A: it sometimes did not answer", False),
+        (Fault("clock drift", 1.0, math.inf, 0), "A: the clocks of A and B disagree", True),
+        (Fault("torque stuck", 1.0, math.inf, 0), "AB: its effort is stuck", False),
+        (Fault("torque stuck", 1.0, math.inf, 0), "module A: its efforts are stuck", True),
+        (Fault("coordinator crash", 1.0, math.inf), "A: its encoder is stuck", False),
+    ],
+)
+def test_a_fault_is_named_by_whole_words_and_whole_serials(fault: Fault, text: str, named: bool) -> None:
+    assert fault.is_named(text, ("A", "B")) is named
+
+
+def test_every_module_has_room_about_where_it_begins(drawn: Any) -> None:
+    for one in drawn[:50]:
+        ranges = schedule.position_ranges(one)
+        for module in one.robot.modules:
+            low, high = ranges[module.serial]
+            assert low + 0.79 < module.start_rad < high - 0.79
+        # The same whatever else is simpler about the session.
+        assert schedule.position_ranges(one._replace(network="none", faults=())) == ranges
 
 
 @pytest.mark.parametrize(
