@@ -8,7 +8,7 @@ After a stop, and where the coordinator has gone, it acquires the lease again.
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from coordinator.live_robot.messenger import Sender
 from module_agent.control.gains import default_gains
@@ -129,7 +129,7 @@ class RecklessHolder:
     ) -> None:
         status, target = self._status, self._target
         assert status is not None
-        head = {
+        head: dict[str, Any] = {
             "serial": target.serial,
             "boot": status.boot,
             "sender": self._sender.name,
@@ -140,7 +140,11 @@ class RecklessHolder:
             setting = GainsCommand(**head, seq=self._seq, gains=gains)
             at = key(target.robot, target.serial, Leaf.GAINS)
             self._transport.query(at, self._proven(setting), 0.5, lambda event: None, self._seq)
-        aims = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
+        aims: dict[str, Any] = {
+            "position_rad": position_rad,
+            "velocity_rad_s": velocity_rad_s,
+            "effort_nm": effort_nm,
+        }
         point = Setpoint(**head, seq=self._seq, **aims)
         self._transport.publish(key(target.robot, target.serial, Leaf.SETPOINT), self._proven(point))
         self._seq += 1
