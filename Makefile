@@ -66,8 +66,10 @@ thesis: $(STAMP)
 	$(BIN)/x5-sim thesis --quick --out runs/thesis
 	@echo "Read it: runs/thesis/report.html"
 
+# Processes in real time have the machine to themselves: next to other work their messages come too late.
 test: $(DEV)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not integration and not benchmark"
+	$(BIN)/python -m pytest -m "integration and not benchmark"
 
 # Processes of their own and compiled kernels are not counted; tracing makes everything about twice as slow.
 coverage: $(DEV)
