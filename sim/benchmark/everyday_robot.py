@@ -34,8 +34,6 @@ from sim.world.world import TICK_NS, World
 # As long and as large as firmware and messages take.
 LIFETIME_NS, RENEWED_NS, BATCH_ROWS = 1_000_000_000, STATUS_PERIOD_NS // 2, 64
 _TICKS_OF_A_RUN = 256
-# Never: what the truth was is not kept.
-_NO_TRUTH = 1 << 62
 # Shares of the speed at which joints may travel, and the mean and the longest of the pauses.
 TRAVEL_SHARE, PAUSE_S, MAX_PAUSE_S, SETTLE_S = (0.4, 1.0), 4.0, 30.0, 0.3
 
@@ -65,7 +63,7 @@ class EverydayRobot:
         self._name, self._feedback = robot.name, feedback
         count = len(robot.serials)
         self._loops, self._quiet = LoopInside(self.world), QuietTicks(count)
-        self._run = QuietRun(self.world, TruthLog(self.world, _NO_TRUTH), self._quiet)
+        self._run = QuietRun(self.world, TruthLog(self.world, every=None), self._quiet)
         self.modules = tuple(ModuleBench(self._firmware(place), RENEWED_NS) for place in range(count))
         for place, module in enumerate(self.modules):
             self._quiet.attach(place, module.firmware, self._loops, place)

@@ -40,6 +40,9 @@ def fleet(
     move: Annotated[
         bool, typer.Option("--move", help="Hold all joints and move one of each robot at a time.")
     ] = False,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Write each robot's truth.json and truth.npz.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for logs and truths [a temporary one].")] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -65,7 +68,8 @@ def fleet(
     with ExitStack() as opened:
         folder = out or Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="x5-fleet-")))
         try:
-            figures = run_fleet(FleetConfig(plan, folder, seconds, speed, seed, move), _note)
+            config = FleetConfig(plan, folder, seconds, speed, seed, move, truth)
+            figures = run_fleet(config, _note)
         except LaunchError as error:
             fail(str(error), EXIT_FAILED)
     table = new_table(None, "process | number | CPU % | MiB | threads | sockets")

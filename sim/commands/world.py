@@ -12,7 +12,7 @@ from coordinator.runtime.event_loop import SIGNALS
 from module_agent.model.errors import UsageError
 from sim.commands.options import WorldOptions, load
 from sim.world.bus_server import BusServer
-from sim.world.truth import TruthLog, write_truth
+from sim.world.truth import EVERY_TICKS, TruthLog, write_truth
 from sim.world.world import World
 
 # How long the world waits for an agent's command on a busy machine before it steps without it. A late step is
@@ -43,7 +43,7 @@ def world(
             imu_rate_hz=settings.imu_rate_hz,
             physics=settings.physics or "pybullet",
         )
-        log = TruthLog(plant)
+        log = TruthLog(plant, None if truth is None else EVERY_TICKS)
         server = BusServer(bus, log, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
     except OSError as error:
         raise UsageError(str(error)) from error

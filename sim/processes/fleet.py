@@ -40,7 +40,10 @@ _GRACE_S = 60.0
 
 
 class FleetConfig(NamedTuple):
-    """How long and how fast a fleet runs, whether its robots move, and the folder of its logs."""
+    """How long and how fast a fleet runs, whether its robots move, and the folder of its logs.
+
+    With `truth` every world writes the true motion there; it takes 0.4 MB a second for 64 modules until then.
+    """
 
     plan: FleetPlan
     out: Path
@@ -48,6 +51,7 @@ class FleetConfig(NamedTuple):
     speed: float = 1.0
     seed: int = 0
     moves: bool = False
+    truth: bool = False
 
 
 def run_fleet(config: FleetConfig, report: Callable[[str], None]) -> FleetFigures:
@@ -103,6 +107,7 @@ def _launch(config: FleetConfig, robot: PlannedRobot, number: int) -> LaunchConf
         processes=robot.processes,
         # Chains that hang from a ceiling touch nothing: the engine that costs less does.
         physics="compiled",
+        truth=config.truth,
     )
 
 

@@ -54,7 +54,7 @@ class LaunchConfig(NamedTuple):
     that it is run by, such as `nsenter` with a network namespace. `secure` is a folder of keys.
     `safety` are the limits of the modules by serial, which the agents read from `safety.toml` in the run's
     folder. With `hebi` the agents speak to the modules through the driver of real ones, over a stand-in for
-    hebi-py.
+    hebi-py. With `truth` the world keeps the true motion in its memory, for the run's folder.
     """
 
     robot_file: str
@@ -76,6 +76,7 @@ class LaunchConfig(NamedTuple):
     hebi: bool = False
     secure: Path | None = None
     safety: Mapping[str, Safety] = MappingProxyType({})
+    truth: bool = True
 
     @property
     def shares(self) -> list[tuple[str, ...]]:
@@ -138,7 +139,7 @@ class Launcher:
         """Start the world and wait until its bus listens."""
         config = self.config
         arguments = ["sim.main", "world", config.robot_file, "--bus", self.bus, "--seed", str(config.seed)]
-        arguments += ["--speed", str(config.speed), "--truth", str(config.out)]
+        arguments += ["--speed", str(config.speed), *(("--truth", str(config.out)) if config.truth else ())]
         arguments += ["--imu-rate-hz", str(config.imu_rate_hz), "--physics", config.physics]
         arguments += config.noise.arguments
         for push in config.pushes:

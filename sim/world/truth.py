@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from module_agent.hardware.hardware import Readings
 from module_agent.model.chain import Chain
@@ -27,8 +28,10 @@ from sim.world.world_kernel import keep_truth
 VERSION = 1
 # The ticks of a call in which nothing else happens.
 MANY_TICKS = 256
-# Rows of a `TruthLog` to begin with.
-_ROWS = 4096
+# Every how many ticks the true motion is recorded: as often as modules report theirs.
+EVERY_TICKS = 4
+# Rows of a block of a `TruthLog`: 16 s of every fourth tick.
+_BLOCK_ROWS = 4096
 
 
 class Truth(NamedTuple):
@@ -115,17 +118,27 @@ def read_truth(path: Path) -> Truth:
 
 
 class TruthLog:
-    """Steps `world` and records its true motion, every `every` ticks."""
+    """Steps `world` and records its true motion, every `every` ticks, or nothing of it with None.
 
-    def __init__(self, world: World, every: int = 4):
-        if every < 1:
+    Rows are in blocks of a fixed size: what is recorded is not copied until `motion` is called, so that no
+    tick waits for more than the memory of one block.
+
+    Raises:
+        DataError: `every` is less than 1.
+    """
+
+    def __init__(self, world: World, every: int | None = EVERY_TICKS):
+        if every is not None and every < 1:
             raise DataError(f"every {every} ticks: at least 1")
         self.modules = world.modules
         self.world = world
-        # Ticks so far, rows so far, and every how many ticks there is a row.
-        self._counts = np.array([0, 0, every])
-        self._t_ns = np.zeros(_ROWS, dtype=np.int64)
-        self._rows = np.zeros((_ROWS, 3, len(world.modules)))
+        # Ticks so far, rows in the present block so far, and every how many ticks there is a row (0: never).
+        self._counts = np.array([0, 0, every or 0])
+        self._full: list[tuple[NDArray[np.int64], Array]] = []
+        self._t_ns, self._rows = self._block(0 if every is None else _BLOCK_ROWS)
+
+    def _block(self, rows: int) -> tuple[NDArray[np.int64], Array]:
+        return np.zeros(rows, dtype=np.int64), np.zeros((rows, 3, len(self.modules)))
 
     def exchange(self, pwm: Sequence[float]) -> Readings:
         """Step the world, record the instant of its samples if it is due, and return its readings."""
@@ -150,17 +163,19 @@ class TruthLog:
 
     def begin_run(self, ticks: int) -> tuple[Any, ...]:
         """Return arrays with room for so many ticks: times, rows, and counts, as `keep_truth` takes them."""
-        rows = self._counts[1] + ticks
-        if rows > len(self._t_ns):
-            self._t_ns = np.concatenate((self._t_ns, np.zeros(rows, dtype=np.int64)))
-            self._rows = np.concatenate((self._rows, np.zeros((rows, *self._rows.shape[1:]))))
+        _, rows, every = self._counts.tolist()
+        if every and rows + ticks > len(self._t_ns):
+            self._full.append((self._t_ns[:rows], self._rows[:rows]))
+            self._t_ns, self._rows = self._block(max(_BLOCK_ROWS, ticks))
+            self._counts[1] = 0
         return self._t_ns, self._rows, self._counts
 
     def motion(self) -> Motion:
         """Return what has been recorded."""
         n = len(self.world.modules)
         rows = int(self._counts[1])
-        stamps, columns = self._t_ns[:rows].copy(), self._rows[:rows].copy()
+        times, blocks = zip(*self._full, (self._t_ns[:rows], self._rows[:rows]), strict=True)
+        stamps, columns = np.concatenate(times), np.concatenate(blocks)
         clocks = [[module_time(clock, t) for clock in self.world.sensors.clocks] for t in stamps.tolist()]
         clock_ns = np.array(clocks, dtype=np.int64).reshape(-1, n)
         make_read_only((stamps, clock_ns, columns))

@@ -238,6 +238,8 @@ def _copy(q: Array, qd: Array, drives: Array, own_q: Array, own_qd: Array, own_d
 def keep_truth(plant: Array, t_ns: int, truth: Any) -> None:
     """Keep the true state of a tick where it is due; plant as in `WorldArrays`, truth of a `TruthLog`."""
     stamps, rows, counts = truth
+    if counts[2] == 0:
+        return
     due = counts[0] % counts[2] == 0
     counts[0] += 1
     if not due:

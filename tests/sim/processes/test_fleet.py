@@ -58,7 +58,8 @@ def mark(monkeypatch: pytest.MonkeyPatch) -> str:
 def test_a_fleet_on_two_routers_is_measured_and_stopped(tmp_path: Path, mark: str) -> None:
     path = tmp_path / "fleet.json"
     # A fifth of real time, which a busy machine has as well.
-    more = ("--seconds", "4", "--speed", "0.2", "--move", "--json", str(path), "--out", str(tmp_path / "out"))
+    files = ("--truth", "--json", str(path), "--out", str(tmp_path / "out"))
+    more = ("--seconds", "4", "--speed", "0.2", "--move", *files)
     done = subprocess.run(command(*more), capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "broke first" in done.stdout
@@ -93,4 +94,6 @@ def test_an_interrupted_fleet_leaves_no_process(tmp_path: Path, mark: str) -> No
     os.kill(process.pid, signal.SIGINT)
     assert process.wait(LIMIT_S) == 130
     assert not living(mark)
+    # Worlds keep no truth that was not asked for.
+    assert not list(tmp_path.rglob("truth.*"))
     assert log.read_text().splitlines()[-1].endswith("interrupted, everything is stopped")

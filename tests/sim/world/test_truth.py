@@ -1,5 +1,6 @@
 import json
 import os
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from module_agent.model.errors import DataError
 from sim.robot.robot_file import load_robot
 from sim.sensors.module_clock import module_time
-from sim.world.truth import Truth, TruthLog, read_motion, read_truth, truth_of, write_truth
+from sim.world.truth import Motion, Truth, TruthLog, read_motion, read_truth, truth_of, write_truth
 from sim.world.world import World
 
 
@@ -104,3 +105,44 @@ def test_a_log_of_nothing_is_empty_but_whole(tmp_path: Path) -> None:
     log = TruthLog(World(load_robot("a2085_03"), seed=3))
     log.save(tmp_path / "truth.npz")
     assert read_motion(tmp_path / "truth.npz").q_rad.shape == (0, 3)
+
+
+def test_rows_of_many_blocks_are_those_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def motion() -> Motion:
+        log = TruthLog(World(load_robot("a2085_03"), seed=3), every=2)
+        for k in range(100):
+            log.exchange([0.1, 0.2 * np.sin(0.1 * k), -0.1])
+        return log.motion()
+
+    one = motion()
+    monkeypatch.setattr("sim.world.truth._BLOCK_ROWS", 7)
+    many = motion()
+    assert len(one.t_ns) == 50
+    for a, b in zip(one[1:], many[1:], strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_tick_takes_no_more_memory_however_much_is_recorded() -> None:
+    """A log that copied what it has would stop the world for longer and longer."""
+    log = TruthLog(World(load_robot("a2085_03"), seed=3), every=1)
+    peaks = []
+    for _ in range(8):
+        tracemalloc.start()
+        # The rows of these ticks fill a block.
+        for _ in range(16):
+            counts = log.begin_run(256)[-1]
+            counts[1] += 256
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert max(peaks[1:]) < 1.5 * peaks[1]
+    assert len(log.motion().t_ns) == 8 * 16 * 256
+
+
+def test_a_log_without_rows_keeps_none() -> None:
+    log = TruthLog(World(load_robot("a2085_03"), seed=3), every=None)
+    for _ in range(9):
+        log.exchange([0.1, 0.0, -0.1])
+    assert log.motion().q_rad.shape == (0, 3)
+    assert log.world.t_ns == 9_000_000
+    with pytest.raises(DataError, match="at least 1"):
+        TruthLog(log.world, every=0)
