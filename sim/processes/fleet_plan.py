@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 from module_agent.model.errors import UsageError
 from sim.processes.launcher import default_processes
+from sim.robot.robot_file import MAX_MODULES
 
 # A router relays to at most so many others.
 BRANCHES = 2
-# Bullet's multibodies have at most this many links.
-MAX_MODULES = 64
 
 
 class PlannedRouter(NamedTuple):
@@ -57,7 +56,7 @@ def plan_fleet(robots: int, modules: int, endpoints: tuple[str, ...], processes:
         processes: agent processes of each robot; by default as `run` has them for one robot on one core.
 
     Raises:
-        UsageError: a robot has too many modules, or there are more leaves than robots.
+        UsageError: a robot has more modules than a robot file may, or there are more leaves than robots.
     """
     if modules > MAX_MODULES:
         raise UsageError(f"--modules {modules}: a robot has at most {MAX_MODULES}; take more robots")

@@ -26,6 +26,7 @@ from sim.imperfections.noise_profile import DEFAULT_PROFILE, noise_profile
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 BASE = "base"
+MAX_MODULES = 64
 
 MountName = Literal["floor", "ceiling", "wall"]
 # Roll, pitch, yaw of the base frame in a world with z up. On the wall its z is horizontal, its y points up.
@@ -227,7 +228,7 @@ class Robot(Strict):
     noise: Annotated[str, _known(noise_profile)] = DEFAULT_PROFILE
     base: Base = Base()
     obstacles: Annotated[tuple[Obstacle, ...], Field(alias="obstacle")] = ()
-    modules: Annotated[tuple[Module, ...], Field(alias="module", min_length=1, max_length=64)]
+    modules: Annotated[tuple[Module, ...], Field(alias="module", min_length=1, max_length=MAX_MODULES)]
 
     @property
     def serials(self) -> tuple[str, ...]:
