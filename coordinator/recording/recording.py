@@ -8,7 +8,7 @@ import copy
 import hashlib
 import struct
 from array import array
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -57,31 +57,32 @@ class RoundTrip(NamedTuple):
 
 
 class Arrivals:
-    """Module times of the newest rows of published messages, and the session times of their arrival [ns]."""
+    """Module times of the newest rows of published messages, and the session times of their arrival [ns].
 
-    def __init__(self, row_ns: Sequence[int] = (), arrival_ns: Sequence[int] = ()) -> None:
-        self._row_ns = array("q", row_ns)
-        self._arrival_ns = array("q", arrival_ns)
+    One thread adds and forgets, others may read and copy meanwhile: both times of a message come and go at
+    once.
+    """
+
+    def __init__(self, times_ns: Iterable[int] = ()) -> None:
+        # In turn: the time of a message's row, and that of its arrival.
+        self._times_ns = array("q", times_ns)
 
     def add(self, row_ns: int, arrival_ns: int) -> None:
         """Note a message."""
-        self._row_ns.append(row_ns)
-        self._arrival_ns.append(arrival_ns)
+        self._times_ns.extend((row_ns, arrival_ns))
 
     def columns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return both times, (n,) each, as a copy: others may be added meanwhile."""
-        # The arrival is added last.
-        arrival = np.array(self._arrival_ns[:], np.int64)
-        return np.array(self._row_ns[: len(arrival)], np.int64), arrival
+        row_ns, arrival_ns = np.array(self._times_ns[:], np.int64).reshape(-1, 2).T.copy()
+        return row_ns, arrival_ns
 
     def copied(self) -> "Arrivals":
         """Return the arrivals so far, to which later ones are not added."""
-        return Arrivals(self._row_ns[:], self._arrival_ns[:])
+        return Arrivals(self._times_ns[:])
 
     def forget(self, kept: int) -> None:
         """Drop all but the newest."""
-        surplus = max(0, len(self._row_ns) - kept)
-        del self._row_ns[:surplus], self._arrival_ns[:surplus]
+        del self._times_ns[: max(0, len(self._times_ns) - 2 * kept)]
 
 
 class ModuleRecord:
@@ -217,11 +218,14 @@ class Recording:
         return message if isinstance(message, Message) else None
 
     def _so_far(self) -> "Recording":
-        """Return a recording of what has been recorded, to which later entries are not added."""
+        """Return a recording of what has been recorded, to which later entries are not added.
+
+        Entries may be added meanwhile by another thread.
+        """
         so_far = Recording()
-        so_far.modules = {serial: module.copied() for serial, module in self.modules.items()}
+        so_far.modules = {serial: module.copied() for serial, module in dict(self.modules).items()}
         so_far.past = {(serial, module.boot): module for serial, module in so_far.modules.items()}
-        so_far.estimates = {pair: dict(estimates) for pair, estimates in self.estimates.items()}
+        so_far.estimates = {pair: dict(each) for pair, each in dict(self.estimates).items()}
         so_far.journal = list(self.journal)
         so_far.not_finite, so_far.damage = dict(self.not_finite), list(self.damage)
         so_far._hash = self._hash.copy()

@@ -2,8 +2,8 @@
 
 Rows are numbered since the module's boot, so that a listener knows which are missing and can request them.
 They are kept as bytes in pages by their number: a row far from all others takes one page, not the memory
-between them, and nothing that is kept moves when earlier rows arrive. One thread adds rows; others may read
-meanwhile, and see a row once it is whole.
+between them, and nothing that is kept moves when earlier rows arrive. One thread adds rows and forgets them;
+others may read and copy meanwhile, and see a row once it is whole.
 """
 
 from typing import NamedTuple
@@ -67,6 +67,9 @@ class RowLog:
         self._first: int | None = None
         self._end = 0
         self._count = 0
+        # Rows below were forgotten: they are neither kept nor missing. How many of them had never arrived.
+        self._forgotten = 0
+        self._lost = 0
         self._pages: dict[int, _Page] = {}
         # Counts changes of the rows; other threads read while rows arrive.
         self._changes = 0
@@ -75,10 +78,21 @@ class RowLog:
     def copied(self) -> "RowLog":
         """Return a log with the rows so far, to which later rows are not added."""
         log = RowLog(self.boot)
-        log._first, log._end, log._count = self._first, self._end, self._count
-        for number, page in self._pages.items():
+        log._first, log._end, log._forgotten = self._first, self._end, self._forgotten
+        for number, page in dict(self._pages).items():
             copy = log._pages[number] = _Page()
-            copy.rows[:], copy.arrived[:] = page.rows, page.arrived
+            # In this order: a row is whole before it is marked.
+            copy.arrived[:] = page.arrived
+            copy.rows[:] = page.rows
+            log._count += copy.arrived.count(1)
+            if (place := copy.arrived.find(1)) >= 0:
+                # Rows may have come since the ends were read.
+                begin = number * PAGE_ROWS
+                log._first = begin + place if log._first is None else min(log._first, begin + place)
+                log._end = max(log._end, begin + copy.arrived.rfind(1) + 1)
+        # Or some may have been forgotten: their mark is set before they are dropped.
+        log.forget_before(self._forgotten)
+        log._lost = self._lost
         return log
 
     @property
@@ -96,13 +110,18 @@ class RowLog:
         """How many rows are kept."""
         return self._count
 
+    @property
+    def lost(self) -> int:
+        """How many of the rows that were forgotten had never arrived."""
+        return self._lost
+
     def has(self, row: int) -> bool:
-        """Return whether a row has arrived."""
+        """Return whether a row has arrived, or was forgotten."""
         page = self._pages.get(row // PAGE_ROWS)
-        return page is not None and bool(page.arrived[row % PAGE_ROWS])
+        return row < self._forgotten or (page is not None and bool(page.arrived[row % PAGE_ROWS]))
 
     def add(self, feedback: Feedback) -> Rows:
-        """Keep the rows of a message; return them.
+        """Keep the rows of a message, but for those that were forgotten; return them.
 
         Raises:
             WireError: the block does not hold what the message announces, or is far from all others.
@@ -110,9 +129,12 @@ class RowLog:
         rows = unpack(feedback)
         if not len(rows):
             return rows
-        first, end = feedback.first_row, feedback.first_row + feedback.count
+        first, end = max(feedback.first_row, self._forgotten), feedback.first_row + feedback.count
+        if first >= end:
+            return rows
         self._check_number(first, end)
-        block, size = memoryview(feedback.rows), ROW.itemsize
+        size = ROW.itemsize
+        block = memoryview(feedback.rows)[(first - feedback.first_row) * size :]
         at = first
         while at < end:
             number, place = divmod(at, PAGE_ROWS)
@@ -146,7 +168,11 @@ class RowLog:
         return page
 
     def missing(self, first: int, end: int) -> list[tuple[int, int]]:
-        """Return the ranges within rows `first` up to and without `end` that have not arrived."""
+        """Return the ranges within rows `first` up to and without `end` that have not arrived.
+
+        What was forgotten is not missing: see `lost`.
+        """
+        first = max(first, self._forgotten)
         low, high = max(first, self.first_row), min(end, self._end)
         if high <= low:
             return [(first, end)] if end > first else []
@@ -208,16 +234,21 @@ class RowLog:
         return index
 
     def forget_before(self, row: int) -> None:
-        """Drop rows below `row`, for listeners with little memory."""
+        """Drop rows below `row`, for listeners with little memory; those that come later are dropped, too."""
         if self._first is None or row <= self._first:
             return
         edge, place = divmod(row, PAGE_ROWS)
-        for number in [number for number in self._pages if number < edge]:
-            self._count -= self._pages.pop(number).arrived.count(1)
-        if (page := self._pages.get(edge)) is not None:
-            self._count -= page.arrived.count(1, 0, place)
-            page.arrived[:place] = bytes(place)
-        self._first = row
+        old, last = [number for number in self._pages if number < edge], self._pages.get(edge)
+        dropped = sum(self._pages[number].arrived.count(1) for number in old)
+        dropped += last.arrived.count(1, 0, place) if last is not None else 0
+        self._lost += min(row, self._end) - self._first - dropped
+        # First: who copies the log meanwhile sees what is no longer whole.
+        self._first = self._forgotten = row
+        self._count -= dropped
+        for number in old:
+            del self._pages[number]
+        if last is not None:
+            last.arrived[:place] = bytes(place)
         self._changes += 1
 
 

@@ -12,6 +12,7 @@ from coordinator.recording.recording import (
     JOURNAL_TOPIC,
     MAX_BOOTS,
     MAX_MODULES,
+    Arrivals,
     Entry,
     Recording,
     RoundTrip,
@@ -20,6 +21,7 @@ from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, Rest, Status, Stop
 from module_agent.wire.refusal import WireError
+from tests.other_thread import repeating
 
 
 @pytest.fixture
@@ -267,3 +269,38 @@ def test_modules_that_were_made_up_do_not_fill_the_memory(
     # The modules that were there before go on being recorded.
     assert recording.accept(wire.publication(Leaf.STATUS, wire.status("M5", t_ns=9))) is not None
     assert recording.modules["M5"].newest_ns == 9
+
+
+def test_a_recording_is_copied_while_another_thread_adds_to_it(wire: SimpleNamespace) -> None:
+    """As a session identifies the chain of the robot without some modules while feedback arrives."""
+    recording = Recording()
+
+    def write(number: int) -> None:
+        # Modules, and what each of them estimated of one joint after the other; rows come and are forgotten.
+        serial, first = f"M{number % 100}", 5 * (number // 100)
+        recording.accept(wire.publication(Leaf.FEEDBACK, wire.feedback(serial, first=first), t_ns=first))
+        recording.accept(wire.publication(Leaf.ESTIMATE, wire.estimate(f"M{number // 100 % 100}", serial)))
+        recording.modules[serial].forget(rows=20, round_trips=0)
+
+    with repeating(write):
+        for _ in range(100):
+            for module in recording.without(("M1",)).modules.values():
+                row_ns, arrival_ns = module.arrivals.columns()
+                # Of five rows, 4 ms apart, the newest; the message came at the number of its first row.
+                assert np.array_equal(row_ns, 4_000_000 * (arrival_ns + 4))
+                stored = module.rows.rows(0, module.rows.end_row)["position_rad"]
+                assert np.array_equal(stored, np.arange(module.rows.first_row, module.rows.end_row))
+
+
+def test_both_times_of_an_arrival_come_and_go_at_once() -> None:
+    arrivals = Arrivals()
+
+    def write(number: int) -> None:
+        arrivals.add(number, -number)
+        arrivals.forget(20)
+
+    with repeating(write):
+        for _ in range(3000):
+            for times in (arrivals.columns(), arrivals.copied().columns()):
+                assert np.array_equal(times[0], -times[1])
+                assert len(times[0]) <= 21

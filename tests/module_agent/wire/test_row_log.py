@@ -13,6 +13,7 @@ from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import WireError
 from module_agent.wire.row_log import MAX_ROWS, RowLog
+from tests.other_thread import repeating
 
 
 def block(first: int, count: int) -> Feedback:
@@ -60,6 +61,80 @@ def test_forgetting_keeps_what_is_newer() -> None:
     log.forget_before(60)
     assert log.rows(0, 100)["t_ns"].tolist() == list(range(60, 100))
     assert log.end_row == 100
+
+
+def test_what_was_forgotten_is_not_missing_and_what_it_lacked_is_counted() -> None:
+    log = RowLog(1)
+    log.add(block(100, 400))
+    log.add(block(520, 480))
+    log.forget_before(900)
+    assert log.missing(100, 1000) == []
+    assert (log.lost, log.count) == (20, 100)
+    # They are not kept when they come late, but for those that are not forgotten.
+    log.add(block(500, 20))
+    log.add(block(895, 10))
+    assert (log.first_row, log.lost, log.count) == (900, 20, 100)
+    assert log.has(505)
+    assert log.missing(0, 1010) == [(1000, 1010)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 900), st.integers(1, 40), st.integers(0, 900)), max_size=30))
+def test_rows_of_a_log_that_forgets_are_kept_lost_or_missing(steps: list[tuple[int, int, int]]) -> None:
+    log, arrived, forgotten, lost = RowLog(1), set[int](), 0, 0
+    for first, count, edge in steps:
+        log.add(block(first, count))
+        arrived |= {n for n in range(first, first + count) if n >= forgotten}
+        low, edge = log.first_row, min(edge, log.end_row)
+        log.forget_before(edge)
+        if edge > low:
+            lost += len(set(range(low, edge)) - arrived)
+            forgotten, arrived = edge, {n for n in arrived if n >= edge}
+    assert (log.lost, log.count) == (lost, len(arrived))
+    assert log.rows(0, 1000)["t_ns"].tolist() == sorted(arrived)
+    missing = {n for a, b in log.missing(log.first_row, log.end_row) for n in range(a, b)}
+    assert missing == set(range(log.first_row, log.end_row)) - arrived
+
+
+def test_a_copy_made_while_rows_come_and_go_has_only_whole_rows() -> None:
+    """Row numbers are the rows' times, so that a row that is not whole, or not its own, shows."""
+    log = RowLog(1)
+    log.add(block(0, 10))
+
+    def write(number: int) -> None:
+        log.add(block(10 * number, 10))
+        if number % 100 == 0:
+            log.forget_before(10 * number - 3000)
+
+    with repeating(write):
+        for _ in range(300):
+            copy = log.copied()
+            rows = copy.between(0, 10**12)["t_ns"]
+            assert rows.tolist() == list(range(copy.first_row, copy.end_row))
+            assert (copy.count, copy.lost) == (len(rows), 0)
+
+
+def test_a_row_that_comes_while_its_page_is_copied_is_whole_or_not_there() -> None:
+    log = RowLog(1)
+    log.add(block(1, 3))
+    page: Any = log._pages[0]
+
+    class Interrupted:
+        """The page; a row comes when half of it has been read."""
+
+        read = 0
+
+        def __getattr__(self, name: str) -> Any:
+            self.read += 1
+            if self.read == 2:
+                log._pages[0] = page
+                log.add(block(4, 1))
+            return getattr(page, name)
+
+    pages: Any = log._pages
+    pages[0] = Interrupted()
+    copy = log.copied()
+    assert log.has(4)
+    assert copy.rows(0, 10)["t_ns"].tolist() == [1, 2, 3]
 
 
 def test_the_end_is_known_however_far_the_log_has_grown() -> None:
