@@ -53,9 +53,9 @@ if TYPE_CHECKING:
 
 _STEP = 1e-6
 _NS = 1e-9
-# Ten minutes of feedback at 250 Hz, and of lease renewals.
-# Dropping copies the rows that remain, so it is done when there is a tenth more.
-_RETAINED_ROWS, _RETAINED_TRIPS = 150_000, 10_000
+# Ten minutes of feedback at 250 Hz, and how many rows there are to a lease renewal.
+# Dropping is done when there is a tenth more, not with every message.
+_RETAINED_ROWS, _ROWS_A_TRIP = 150_000, 15
 # Feedback is published whether a module is held or not; a network may lose some.
 _FEEDBACK_S = 3.0
 
@@ -276,7 +276,7 @@ def _undetermined(robot: SavedRun | Identified) -> Mapping[str, Sequence[str]]:
 
 
 class LiveRobot:
-    """A connected robot: what it has sent in the last ten minutes is in `recording`; `group` takes commands.
+    """A connected robot: what it has sent last is in `recording`, see `connect`; `group` takes commands.
 
     Modules that are not held move for other programs and send their feedback all the same.
     """
@@ -345,6 +345,7 @@ async def connect(
     routers: Sequence[str] = (),
     expect: int | None = None,
     timeout_s: float = 15.0,
+    retained_rows: int = _RETAINED_ROWS,
 ) -> AsyncIterator[LiveRobot]:
     """Connect to a robot on the network: `async with connect("my_arm", expect=4) as arm: ...`.
 
@@ -354,6 +355,8 @@ async def connect(
         routers: Zenoh routers to connect to instead.
         expect: how many modules there are; by default all that answer until none has come for a second.
         timeout_s: how long to wait for them.
+        retained_rows: how many of each module's newest feedback rows are kept, at 101 bytes each; by default
+            those of ten minutes.
 
     Raises:
         UsageError: the network cannot be joined.
@@ -363,7 +366,7 @@ async def connect(
     recording = Recording()
     transport = open_connection(Place(robot, listen, tuple(routers)), lambda text: None).transport
     messenger = Messenger(
-        transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, _recorder(recording)
+        transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, _recorder(recording, retained_rows)
     )
     live = LiveRobot(messenger, ModuleGroup(messenger, recording, time.monotonic_ns, new_sender()), recording)
     try:
@@ -384,7 +387,7 @@ def _recorder(recording: Recording, retained_rows: int = _RETAINED_ROWS) -> Reco
         if isinstance(message, Feedback):
             module = recording.module(message.serial, message.boot)
             if module.rows.end_row - module.rows.first_row > 1.1 * retained_rows:
-                module.forget(retained_rows, _RETAINED_TRIPS)
+                module.forget(retained_rows, retained_rows // _ROWS_A_TRIP)
         return message
 
     return record

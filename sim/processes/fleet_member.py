@@ -12,7 +12,7 @@ import time
 from contextlib import suppress
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,13 @@ from coordinator.api import LiveRobot, connect
 from module_agent.model.errors import RobotError
 from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.messages import WindowedSine
+from module_agent.wire.row_log import RowLog
 
 READY = "ready"
 ASK_EVERY_S = 0.5
 START_TIMEOUT_S = 120.0
+# Of each module, ten seconds: the memory of a coordinator is flat, however long it listens.
+RETAINED_ROWS = 2_500
 # Of one joint, while all others hold; short, since a coordinator waits only 3 s beyond a motion's own time.
 MOTION = WindowedSine(amplitude=0.05, centre_s=0.25, sigma_s=0.1)
 
@@ -61,7 +64,8 @@ async def coordinate(robot: str, router: str, modules: int, seconds: float, begi
 
     A robot that `moves` is held, and its joints move in turn.
     """
-    async with connect(robot, routers=(router,), expect=modules, timeout_s=START_TIMEOUT_S) as arm:
+    settings: Any = {"expect": modules, "timeout_s": START_TIMEOUT_S, "retained_rows": RETAINED_ROWS}
+    async with connect(robot, routers=(router,), **settings) as arm:
         if moves:
             await arm.hold()
         print(READY, flush=True)
@@ -93,9 +97,28 @@ async def _move(arm: LiveRobot, done: list[bool]) -> None:
             done.append(True)
 
 
+class RowCount:
+    """Counts the rows of a log from now on, come and lost, while old ones are forgotten.
+
+    Of the rows so far only the newest is kept, so that one which comes late is not counted.
+    """
+
+    def __init__(self, log: RowLog):
+        self._log, self._begin = log, log.end_row
+        log.forget_before(self._begin - 1)
+        self._lost = log.lost
+
+    def __call__(self) -> tuple[int, int]:
+        """Return how many rows have come, and how many of the numbers up to the newest are missing."""
+        log = self._log
+        missing = sum(end - first for first, end in log.missing(log.first_row, log.end_row))
+        lost = missing + log.lost - self._lost
+        return log.end_row - self._begin - lost, lost
+
+
 async def _listen(arm: LiveRobot, seconds: float) -> Heard:
     logs = {serial: arm.group.module(serial).rows for serial in arm.serials}
-    first = {serial: log.end_row for serial, log in logs.items()}
+    counts = [RowCount(log) for log in logs.values()]
     start_ns = {serial: _newest_ns(arm, serial) for serial in logs}
     trips_ms: list[float] = []
     unanswered, start_s = 0, time.monotonic()
@@ -117,10 +140,8 @@ async def _listen(arm: LiveRobot, seconds: float) -> Heard:
                 await ask(serial)
         await asyncio.sleep(ASK_EVERY_S)
     spent_s = time.monotonic() - start_s
-    ranges = [(log, first[serial], log.end_row) for serial, log in logs.items()]
-    lost = sum(b - a for log, low, high in ranges for a, b in log.missing(low, high))
     passed_s = min(1e-9 * (_newest_ns(arm, serial) - start_ns[serial]) for serial in logs)
-    rows = sum(high - low for _, low, high in ranges) - lost
+    rows, lost = (sum(each) for each in zip(*(count() for count in counts), strict=True))
     return Heard(rows, lost, unanswered, tuple(np.round(trips_ms, 3)), passed_s / spent_s, spent_s)
 
 
