@@ -3,7 +3,8 @@
 Joints that have not moved yet count as locked: a module is mounted on the nearest explored joint that moves
 it, and modules without a link to another one yet are excluded. The chain is assembled from the modules'
 joint regressions (`kinematics.assembly`); the batch estimate follows at the end of the run. Every motion
-is filtered once and its thinned samples retained, so that a preview costs little more than its refinement.
+is filtered once and its thinned samples retained as long as it is the latest of its kind, so that a preview
+costs little more than its refinement.
 
 While all joints move at once, the part of their motion that is over is regressed on all of them instead
 (`kinematics.simultaneous_motion`): nothing is shown before the joints can be told apart and the topology is
@@ -254,12 +255,14 @@ class Previewer:
         if not moved:
             raise DataError("no motion of these modules is recorded")
         all_serials = tuple(sorted(self._recording.modules))
+        # Of a motion that was repeated, or from before a module joined, nothing is needed any more.
+        for stale in self._parts.keys() - {_key(event, all_serials) for event in motions}:
+            del self._parts[stale]
         order = [all_serials.index(s) for s in serials]
         return [_columns(self._part(event, all_serials), order) for event in moved]
 
     def _part(self, event: JournalEvent, serials: tuple[str, ...]) -> SensorData:
-        assert event.motion is not None
-        key = (event.serial, event.motion.motion_id, serials)
+        key = _key(event, serials)
         if key not in self._parts:
             self._parts[key] = self._filtered(event, serials)
         return self._parts[key]
@@ -268,6 +271,11 @@ class Previewer:
         clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
         windows = unbroken_windows(self._recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
         return thinned([filtered(one, REFINEMENT_CUTOFF_HZ) for one in windows], RETAINED_EVERY)
+
+
+def _key(event: JournalEvent, serials: tuple[str, ...]) -> tuple[str, int, tuple[str, ...]]:
+    assert event.motion is not None
+    return event.serial, event.motion.motion_id, serials
 
 
 def _columns(part: SensorData, at: Sequence[int]) -> SensorData:

@@ -78,8 +78,8 @@ from module_agent.model.errors import DataError, UsageError
 from module_agent.transport.transport import Transport
 from module_agent.wire.messages import Message, Pattern
 
-# While all joints move at once there is a preview so often, or as seldom as keeps previews to a share of the
-# time: as much of one processor is left to the network and the recording, whatever the robot's size.
+# While all joints move at once a preview is asked for so often. Previews are as seldom as keeps them to a
+# share of the time: as much of one processor is left to network and recording, whatever the robot's size.
 PREVIEW_EVERY_S = 2.0
 PREVIEW_SHARE = 0.25
 
@@ -204,6 +204,7 @@ class Run:
         self._feed = ViewerFeed(viewer, self.recording, overlay)
         self._previewer = Previewer(self.recording, config.refined_previews)
         self._preview_task: asyncio.Task[None] | None = None
+        self._wanted_preview: Callable[[], Preview | None] | None = None
         self._next_preview_ns = 0
         self._chain: Chain | None = None
         self._explored: Kinematics | None = None
@@ -282,18 +283,32 @@ class Run:
         while True:
             await asyncio.sleep(PREVIEW_EVERY_S)
             motion = self._group.running(serials[0])
-            if motion is not None and self._clock() >= self._next_preview_ns:
+            if motion is not None:
                 event = JournalEvent(
                     t_ns=self._clock(), what="motion", serial=serials[0], purpose="whole", motion=motion
                 )
                 self._begin_preview(partial(self._previewer.preview_of_all, event, serials))
 
     def _begin_preview(self, work: Callable[[], Preview | None]) -> None:
+        """Show a preview: in virtual time at once, else when it is time for one, if no other is asked for."""
         if self._config.inline:
             self._show_preview(self._preview(work))
-        elif self._preview_task is None or self._preview_task.done():
-            # One preview at a time: while one is being computed, no other is begun.
-            self._preview_task = asyncio.create_task(self._show_preview_later(work))
+        else:
+            self._wanted_preview = work
+            self._begin_wanted_preview()
+
+    def _begin_wanted_preview(self) -> None:
+        """Begin what was asked for last, unless a preview is being computed; if it is too early, later."""
+        work = self._wanted_preview
+        if work is None or not (self._preview_task is None or self._preview_task.done()):
+            return
+        early_s = 1e-9 * (self._next_preview_ns - self._clock())
+        if early_s > 0.0:
+            asyncio.get_running_loop().call_later(early_s, self._begin_wanted_preview)
+            return
+        self._wanted_preview = None
+        self._preview_task = asyncio.create_task(self._show_preview_later(work))
+        self._preview_task.add_done_callback(lambda _: self._begin_wanted_preview())
 
     async def _show_preview_later(self, work: Callable[[], Preview | None]) -> None:
         began_ns = self._clock()
@@ -316,7 +331,11 @@ class Run:
             self._feed.preview(self._clock(), preview)
 
     async def _await_preview(self) -> None:
-        """Wait for a preview that is still being computed, so that it does not replace a newer chain."""
+        """Wait for a preview that is still being computed, so that it does not replace a newer chain.
+
+        One that waits for its time is dropped.
+        """
+        self._wanted_preview = None
         if self._preview_task is not None:
             (failure,) = await asyncio.gather(self._preview_task, return_exceptions=True)
             if isinstance(failure, Exception):

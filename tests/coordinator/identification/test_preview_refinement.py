@@ -121,3 +121,18 @@ def test_the_samples_of_a_preview_are_bounded(recording: Recording, monkeypatch:
     assert bounded is not None
     apart = bounded.fit.link_length_m[1] - whole.fit.link_length_m[1]
     assert 0.0 < abs(apart) < 3.0 * sigma(bounded)
+
+
+def test_samples_are_retained_of_the_latest_motions_only(recording: Recording) -> None:
+    """However often a joint repeats its motions, and modules join."""
+    previewer = Previewer(recording)
+    event = recording.latest_motions("windowed_sine")[0]
+    assert event.motion is not None
+    for motion_id in range(1000, 1004):
+        again = event.motion.model_copy(update={"motion_id": motion_id})
+        recording.journal.append(event.model_copy(update={"motion": again}))
+        assert previewer.preview([BASE, TIP]) is not None
+        assert len(previewer._parts) == 4
+    recording.modules["X-joined"] = recording.modules[TIP]
+    assert previewer.preview([BASE, TIP]) is not None
+    assert len(previewer._parts) == 4

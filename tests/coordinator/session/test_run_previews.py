@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import threading
+import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,6 +81,32 @@ def test_previews_are_computed_one_at_a_time_while_the_run_goes_on(tmp_path: Pat
     asyncio.run(explore())
     assert slow.asked == [["A"], ["A", "B", "C"]]
     assert shown == [("A",), ("A", "B", "C")]
+
+
+def test_previews_of_joints_take_no_more_than_their_share_and_the_last_one_asked_for_is_shown(
+    tmp_path: Path,
+) -> None:
+    begun_ns, shown, took_s = list[int](), [], 0.02
+
+    def preview(explored: Collection[str]) -> Any:
+        begun_ns.append(time.monotonic_ns())
+        time.sleep(took_s)
+        return SimpleNamespace(explored=tuple(explored))
+
+    async def explore() -> None:
+        run = run_of(tmp_path, SimpleNamespace(preview=preview), shown, clock=time.monotonic_ns)
+        joints = [f"J{k}" for k in range(12)]
+        for k in range(12):
+            explore_until(run, *joints[: k + 1])
+            await asyncio.sleep(0.25 * took_s)
+        async with asyncio.timeout(10.0):
+            while not shown or len(shown[-1]) < 12:
+                await asyncio.sleep(0.25 * took_s)
+        await run._await_preview()
+
+    asyncio.run(explore())
+    assert len(shown) == len(begun_ns) >= 2
+    assert min(np.diff(begun_ns)) >= 1e9 * took_s / PREVIEW_SHARE
 
 
 def test_in_virtual_time_a_preview_is_computed_before_the_call_returns(tmp_path: Path) -> None:
