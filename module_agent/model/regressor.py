@@ -47,7 +47,9 @@ def torque_regressor(
         q_rad, qd_rad_s, qdd_rad_s2: (m, n) joint positions, velocities and accelerations.
         out: (m, n, 10 n) where the result is written: zeros, or what was written for a chain with the same
             parents. New memory costs three times the calculation.
-        threads: in how many the samples are divided; the result is the same.
+        threads: in how many the samples are divided; the result is the same. Of a run no part has more than
+            one: of the information of 20,000 samples of 7 joints (`information.gather`) the regressor takes
+            9 ms, and the QR decompositions take 0.2 s. It is for who needs the matrix itself.
 
     Returns:
         (m, n, 10 n), read-only. `phi` stacks [m, mcx, mcy, mcz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz] body by body
@@ -77,7 +79,10 @@ def torque_regressor(
 class RegressorStream:
     """The regressor of one chain, one sample after the other, into the same array; motions are not checked.
 
-    A call takes a tenth of the time of `torque_regressor`, and gives the same bits.
+    A call gives the same bits as `torque_regressor`, without its checks. It is for parameters that change
+    from sample to sample. Torque control has constant ones: `inverse_dynamics` gives the torques of a whole
+    motion without a regressor, and gravity compensation, which has one sample at a time, would save 7 us of
+    the 5 ms between its set-points (7 joints).
     """
 
     def __init__(self, chain: Chain):
