@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,25 +23,15 @@ from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.virtual_time.run import VirtualConfig, run_virtual
 from sim.world.world import World
-from tests.benchmarks.bars import report
+from tests.benchmarks.bars import least_cpu_s, report
 from tests.module_agent.wired_firmware import WiredFirmware
 
 pytestmark = pytest.mark.benchmark
 
 
-def _seconds(work: Callable[[], object], count: int) -> float:
-    """The best mean of three rounds, per call."""
-    best = float("inf")
-    for _ in range(3):
-        start = time.perf_counter()
-        for _ in range(count):
-            work()
-        best = min(best, (time.perf_counter() - start) / count)
-    return best
-
-
-def _report(what: str, figure: str) -> None:
-    print(f"\n{what:.<60} {figure}")
+def _report(what: str, work: Callable[[], object], calls: int, of: int = 1) -> None:
+    """Report the processor time of a call, or of each of its `of` parts."""
+    report(what, 1e6 * least_cpu_s(work, 3, calls) / of, "us")
 
 
 @pytest.mark.parametrize(("name", "noise"), [("a2085_04", "x5-uncalibrated"), ("arm7", "poor")])
@@ -55,9 +46,8 @@ def test_virtual_time_over_real_time(tmp_path: Path, name: str, noise: str, dyna
     wall_s = time.perf_counter() - start
     assert result.robot_time_s > 0.0
     what = f"{name}, {noise}, whole run{' with dynamics' if dynamics else ''}"
-    _report(
-        what, f"{result.robot_time_s:.1f} s in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x real time"
-    )
+    anchor = f"{result.robot_time_s:.1f} s in {wall_s:.1f} s"
+    report(what, result.robot_time_s / wall_s, "times real time", anchor=anchor)
 
 
 def test_firmware_step() -> None:
@@ -71,18 +61,14 @@ def test_firmware_step() -> None:
         sample = SensorSample(now, now // 4_000_000 * 4_000_000, *([0.0] * 6), 40.0, 24.0, *([0.0] * 6))  # type: ignore[call-arg]
         wired.tick(sample)
 
-    _report(
-        "firmware tick with its loops, one module, idle, 250 rows/s", f"{1e6 * _seconds(tick, 5000):.1f} us"
-    )
+    _report("firmware tick with its loops, one module, idle, 250 rows/s", tick, 5000)
 
 
 @pytest.mark.parametrize("name", ["thesis_171_horizontal", "a2085_04", "snake16"])
 def test_world_tick(name: str) -> None:
     world = World(load_robot(name), seed=0)
     pwm = [0.01] * len(world.modules)
-    _report(
-        f"world tick, {name}, {len(pwm)} modules", f"{1e6 * _seconds(lambda: world.step(pwm), 500):.0f} us"
-    )
+    _report(f"world tick, {name}, {len(pwm)} modules", lambda: world.step(pwm), 500)
     world.close()
 
 
@@ -92,11 +78,10 @@ def test_codec() -> None:
     request = LeaseRequest(serial="A", boot=1, seq=1, sender="C", token=1, echo_ns=1, action="renew")
     for name, message in (("feedback of 5 rows", feedback), ("lease request", request)):
         payload = encode(message)
-        kind = type(message)
-        there = _seconds(lambda message=message: encode(message), 5000)
-        back = _seconds(lambda kind=kind, payload=payload: decode(kind, payload, MAX_MESSAGE_BYTES), 5000)
-        _report(f"codec, {name}, {len(payload)} bytes", f"{1e6 * there:.1f} us out, {1e6 * back:.1f} us in")
-    _report("codec, rows unpacked and checked", f"{1e6 * _seconds(lambda: unpack(feedback), 5000):.1f} us")
+        what = f"codec, {name}, {len(payload)} bytes"
+        _report(f"{what}, encoded", partial(encode, message), 5000)
+        _report(f"{what}, decoded", partial(decode, type(message), payload, MAX_MESSAGE_BYTES), 5000)
+    _report("codec, rows unpacked and checked", partial(unpack, feedback), 5000)
 
 
 def test_regressor_against_pinocchios_loop() -> None:
@@ -123,5 +108,4 @@ def test_regressor_against_pinocchios_loop() -> None:
 def test_imu_prediction() -> None:
     chain = true_chain(load_robot("a2085_04"))
     q, qd, qdd = np.random.default_rng(1).uniform(-1, 1, (3, 4000, 4))
-    each = _seconds(lambda: imu_readings(chain, q, qd, qdd), 5) / 4000
-    _report("IMU prediction, 4 modules, a sample", f"{1e6 * each:.2f} us")
+    _report("IMU prediction, 4 modules, a sample", partial(imu_readings, chain, q, qd, qdd), 5, of=4000)
