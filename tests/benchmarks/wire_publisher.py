@@ -106,7 +106,7 @@ def publish(send: Send, numbers: range, seconds: float) -> Sent:
         t_ns = time.monotonic_ns()
         for number in numbers:
             send(number, row, t_ns)
-        if row == rows // 4:
+        if row == rows // 2:
             early_kb = resident_kb()
     spent_s = time.process_time() - cpu_s
     time.sleep(0.5)
