@@ -1,8 +1,10 @@
 """A barrier as bare as it can be in Python, for the world's to be compared with.
 
-A server and processes on Unix SEQPACKET sockets exchange frames of the physics bus's sizes in lock-step; each
-process puts one message of feedback's size by Zenoh for each of its modules every 20 ticks, to the server's
-process. Nothing is computed. `python -m tests.benchmarks.bare_barrier PATH MODULES ENDPOINT` is one process.
+A server, as the world, and processes, as the agents, exchange frames of the physics bus's sizes on Unix
+SEQPACKET sockets in lock-step; each process puts one message of feedback's size by Zenoh for each of its
+modules every 20 ticks, to a listener's process, in place of router and coordinator. Nothing is computed.
+`python -m tests.benchmarks.bare_barrier agent PATH MODULES ENDPOINT` is one process, and
+`python -m tests.benchmarks.bare_barrier listener ENDPOINT` is the listener.
 """
 
 import os
@@ -11,7 +13,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -24,10 +26,19 @@ ROOT = Path(__file__).parents[2]
 
 
 class BareFigures(NamedTuple):
-    """Processor time of all processes for each module and tick, and of a tick, by the wall [us]."""
+    """Processor time for each module and tick, of server and agents, and of the listener [us].
 
-    us_per_module_tick: float
+    tick_us: of a tick, by the wall.
+    """
+
+    served_us: float
+    heard_us: float
     tick_us: float
+
+    @property
+    def all_us(self) -> float:
+        """Processor time of all processes for each module and tick."""
+        return self.served_us + self.heard_us
 
 
 def attach(path: str, modules: int, endpoint: str) -> None:
@@ -54,9 +65,8 @@ def attach(path: str, modules: int, endpoint: str) -> None:
     session.close()  # type: ignore[no-untyped-call]
 
 
-def measure(folder: Path, processes: int, modules: int, seconds: float, endpoint: str) -> BareFigures:
-    """Run a barrier of `modules` modules in `processes` processes as fast as it goes."""
-    path, each = str(folder / "bare"), modules // processes
+def listen(endpoint: str) -> None:
+    """Hear all messages until the input ends; print how many there were."""
     heard = [0]
 
     def hear(_: zenoh.Sample) -> None:
@@ -64,10 +74,24 @@ def measure(folder: Path, processes: int, modules: int, seconds: float, endpoint
 
     session = zenoh.open(_session_config(ZenohConfig(listen=(endpoint,))))
     subscriber = session.declare_subscriber("bare/**", zenoh.handlers.Callback(hear, indirect=False))
+    print("ready", flush=True)
+    sys.stdin.read()
+    subscriber.undeclare()
+    session.close()  # type: ignore[no-untyped-call]
+    print(heard[0], flush=True)
+
+
+def measure(folder: Path, processes: int, modules: int, seconds: float, endpoint: str) -> BareFigures:
+    """Run a barrier of `modules` modules in `processes` processes as fast as it goes."""
+    path, each = str(folder / "bare"), modules // processes
+    program = [sys.executable, "-m", "tests.benchmarks.bare_barrier"]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    hub = subprocess.Popen([*program, "listener", endpoint], cwd=ROOT, **pipes)
+    assert hub.stdout.readline() == "ready\n"
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(path)
     listener.listen(processes)
-    command = [sys.executable, "-m", "tests.benchmarks.bare_barrier", path, str(each), endpoint]
+    command = [*program, "agent", path, str(each), endpoint]
     children = [subprocess.Popen(command, cwd=ROOT) for _ in range(processes)]
     agents = [listener.accept()[0] for _ in children]
     frames = TickFrames.of(each)
@@ -81,11 +105,13 @@ def measure(folder: Path, processes: int, modules: int, seconds: float, endpoint
 
     for _ in range(200):
         tick()
-    ticks, begun_s, cpu_s = 0, time.monotonic(), _cpu_s(children)
+    ticks, begun_s = 0, time.monotonic()
+    served_s, heard_s = time.process_time() + _cpu_s(children), _cpu_s([hub])
     while time.monotonic() < begun_s + seconds:
         tick()
         ticks += 1
-    spent_s, cpu_s = time.monotonic() - begun_s, _cpu_s(children) - cpu_s
+    spent_s = time.monotonic() - begun_s
+    served_s, heard_s = time.process_time() + _cpu_s(children) - served_s, _cpu_s([hub]) - heard_s
     for agent in agents:
         agent.recv(size)
         agent.close()
@@ -93,20 +119,25 @@ def measure(folder: Path, processes: int, modules: int, seconds: float, endpoint
         child.wait(20.0)
     listener.close()
     os.unlink(path)
-    subscriber.undeclare()
-    session.close()  # type: ignore[no-untyped-call]
-    assert heard[0] > 0, "nothing was heard by Zenoh"
-    return BareFigures(1e6 * cpu_s / ticks / modules, 1e6 * spent_s / ticks)
+    heard, _ = hub.communicate(timeout=20.0)
+    assert int(heard) > 0, "nothing was heard by Zenoh"
+    us = 1e6 / ticks
+    return BareFigures(us * served_s / modules, us * heard_s / modules, us * spent_s)
 
 
-def _cpu_s(children: list["subprocess.Popen[bytes]"]) -> float:
-    """Return the processor time of the children and of this process so far [s]."""
+def _cpu_s(children: list["subprocess.Popen[Any]"]) -> float:
+    """Return the processor time of processes so far [s]."""
     fields = [
         Path(f"/proc/{child.pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13] for child in children
     ]
-    ticks = sum(int(value) for pair in fields for value in pair)
-    return ticks / os.sysconf("SC_CLK_TCK") + time.process_time()
+    return sum(int(value) for pair in fields for value in pair) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":
-    attach(sys.argv[1], int(sys.argv[2]), sys.argv[3])
+    match sys.argv[1:]:
+        case ["agent", bus, count, hub_endpoint]:
+            attach(bus, int(count), hub_endpoint)
+        case ["listener", hub_endpoint]:
+            listen(hub_endpoint)
+        case _:
+            raise SystemExit(__doc__)
