@@ -1,11 +1,17 @@
 """The factory gains and the limits of every module type."""
 
+import math
+
 from module_agent.model.catalogue import ModuleType
 from module_agent.wire.messages import GainSet, Limits, PidGains
 from module_agent.wire.refusal import Refusal, WireError
 
 # Factory gains are up to 30; the thesis' integral gains, if meant per tick of 1 ms, are up to 1000 1/s.
 MAX_GAIN, MAX_INTEGRAL_GAIN = 1e3, 1e4
+# What stands for no limit in a message, which has no infinity.
+UNLIMITED = 1e6
+# The gains that are limits, of which a module may have none.
+_LIMITS = ("i_clamp", "min_output", "max_output")
 
 
 def default_gains(kind: ModuleType, strategy: int) -> GainSet:
@@ -43,7 +49,7 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
 
 
 def check_gains(gains: GainSet) -> None:
-    """Check that gains are of a size that some controller of a module could have.
+    """Check that gains are of a size that some controller of a module could have; limits may be none.
 
     Raises:
         WireError: LIMIT, with the loop, the gain and its range.
@@ -53,10 +59,22 @@ def check_gains(gains: GainSet) -> None:
         for field in ("kp", "ki", "kd", "feed_forward", "punch", "i_clamp", "min_output", "max_output"):
             value: float = getattr(loop, field)
             most = MAX_INTEGRAL_GAIN if field == "ki" else MAX_GAIN
-            if abs(value) > most:
+            if abs(value) > most and not (field in _LIMITS and abs(value) == UNLIMITED):
+                none = ", or inf for no limit" if field in _LIMITS else ""
                 raise WireError(
-                    Refusal.LIMIT, f"{field} {value:g} of the {name} loop; possible are -{most:g} .. {most:g}"
+                    Refusal.LIMIT,
+                    f"{field} {value:g} of the {name} loop; possible are -{most:g} .. {most:g}{none}",
                 )
+
+
+def for_message(value: float) -> float:
+    """Return a gain of a file or of a module as a message carries it; an infinite one is `UNLIMITED`."""
+    return min(max(value, -UNLIMITED), UNLIMITED)
+
+
+def from_message(value: float) -> float:
+    """Return a gain of a message as files and modules have it: infinite where it is `UNLIMITED`."""
+    return value if abs(value) < UNLIMITED else math.copysign(math.inf, value)
 
 
 def catalogue_limits(kind: ModuleType) -> Limits:

@@ -3,17 +3,28 @@
 <group_gains><control_strategy>3 4</control_strategy><position><kp>0.5 15</kp></position></group_gains>
 
 Files may be partial, and their elements come in any order; one value stands for all modules. What a file does
-not say stays as it is. `inf` is legal. Strategies are numbers; their names, which hebi-py refuses, are read.
+not say stays as it is. `inf` is no limit. Strategies are numbers; their names are read, though hebi-py refuses
+them.
 """
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, indent, tostring
+from xml.etree.ElementTree import (
+    Element,
+    ParseError,
+    SubElement,
+    TreeBuilder,
+    XMLParser,
+    fromstring,
+    indent,
+    tostring,
+)
 
 from pydantic import ValidationError
 
+from module_agent.control.gains import for_message, from_message
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
 from module_agent.wire.messages import GainSet, PidGains
@@ -21,12 +32,21 @@ from module_agent.wire.messages import GainSet, PidGains
 ROOTS = ("group_gains", "gains")
 LOOPS = ("position", "velocity", "effort")
 STRATEGIES = ("Off", "DirectPWM", "Strategy2", "Strategy3", "Strategy4")
-# What stands for no limit in a message, which has no infinity.
-UNLIMITED = 1e6
 
 
 class GainsFileError(UsageError):
     """A gains file cannot be read; the message names file and element."""
+
+
+class _Elements(TreeBuilder):
+    """Builds the elements of a gains file, without a document type: its entities may grow to any size."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self._path = path
+
+    def doctype(self, *_: object) -> None:
+        raise GainsFileError(f"{self._path}: a document type has no place in a gains file")
 
 
 def read_gains(path: Path, present: Sequence[GainSet]) -> list[GainSet]:
@@ -37,7 +57,7 @@ def read_gains(path: Path, present: Sequence[GainSet]) -> list[GainSet]:
             cannot be.
     """
     try:
-        root = fromstring(path.read_text(encoding="utf-8"))
+        root = fromstring(path.read_text(encoding="utf-8"), XMLParser(target=_Elements(path)))
     except (OSError, UnicodeDecodeError, ParseError) as error:
         raise GainsFileError(f"{path}: no gains file can be read: {error}") from error
     if root.tag not in ROOTS:
@@ -101,10 +121,10 @@ def _value(path: Path, loop: str, name: str, word: str) -> float | bool:
         raise GainsFileError(f"{path}: {loop}.{name}: {word!r} is no number") from error
     if math.isnan(value):
         raise GainsFileError(f"{path}: {loop}.{name}: {word!r} is no number")
-    return value != 0.0 if name == "d_on_error" else min(max(value, -UNLIMITED), UNLIMITED)
+    return value != 0.0 if name == "d_on_error" else for_message(value)
 
 
 def _text(value: float | bool) -> str:
     if isinstance(value, bool):
         return str(int(value))
-    return repr(float(value)) if abs(value) < UNLIMITED else str(math.copysign(math.inf, value))
+    return repr(from_message(float(value)))

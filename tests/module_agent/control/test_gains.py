@@ -1,8 +1,17 @@
 """Factory gains are the manufacturer's, and those of a holder are of a size that a controller could have."""
 
+import math
+
 import pytest
 
-from module_agent.control.gains import catalogue_limits, check_gains, default_gains
+from module_agent.control.gains import (
+    UNLIMITED,
+    catalogue_limits,
+    check_gains,
+    default_gains,
+    for_message,
+    from_message,
+)
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.wire.messages import PidGains
 from module_agent.wire.refusal import Refusal, WireError
@@ -45,6 +54,9 @@ def test_factory_gains_are_the_published_ones(name: str, strategy: int) -> None:
     )
 
 
+LIMITS = ("i_clamp", "min_output", "max_output")
+
+
 @pytest.mark.parametrize("loop", ["position", "velocity", "effort"])
 @pytest.mark.parametrize(
     ("field", "most"),
@@ -70,9 +82,23 @@ def test_gains_up_to_a_bound_are_taken_and_larger_ones_refused(loop: str, field:
         with pytest.raises(WireError) as error:
             check(sign * 1.001 * most)
         assert error.value.reason is Refusal.LIMIT
-        assert f"{field} {sign * 1.001 * most:g} of the {loop} loop; possible are -{most:g} .. {most:g}" == (
-            error.value.detail
+        none = ", or inf for no limit" if field in LIMITS else ""
+        assert error.value.detail == (
+            f"{field} {sign * 1.001 * most:g} of the {loop} loop; possible are -{most:g} .. {most:g}{none}"
         )
+        # An infinite limit is none.
+        unlimited = for_message(sign * math.inf)
+        assert from_message(unlimited) == sign * math.inf
+        if field in LIMITS:
+            check(unlimited)
+        else:
+            with pytest.raises(WireError):
+                check(unlimited)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.5, 1e3, 0.999 * UNLIMITED])
+def test_finite_gains_are_the_same_in_messages_files_and_modules(value: float) -> None:
+    assert for_message(value) == from_message(value) == value
 
 
 def test_limits_are_those_of_the_type() -> None:

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from module_agent.control.gains import default_gains
+from module_agent.control.gains import check_gains, default_gains, for_message
 from module_agent.control.gains_file import LOOPS, STRATEGIES, GainsFileError, read_gains, write_gains
 from module_agent.hardware import hebi_library
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import UsageError
 from module_agent.wire.messages import GainSet, PidGains
+from module_agent.wire.refusal import WireError
 
 FACTORY = [default_gains(module_type("X5-9"), 3), default_gains(module_type("X5-4"), 4)]
 
@@ -34,11 +35,15 @@ DOCUMENTED = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "gains.xml"
+def _documented(folder: Path) -> Path:
+    path = folder / "documented.xml"
     path.write_text(DOCUMENTED)
     return path
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return _documented(tmp_path)
 
 
 def test_a_partial_file_changes_what_it_says_and_nothing_else(file: Path) -> None:
@@ -60,6 +65,32 @@ def test_what_is_written_is_read_again(file: Path, tmp_path: Path) -> None:
     assert read_gains(tmp_path / "out.xml", FACTORY) == gains
 
 
+def test_limits_that_are_none_are_taken_by_a_module_and_stay_none(file: Path, tmp_path: Path) -> None:
+    for own in read_gains(file, FACTORY):
+        check_gains(own)
+    file.write_text(
+        "<group_gains>"
+        + "".join(
+            f"<{loop}><i_clamp>inf</i_clamp><min_output>-inf</min_output><max_output>inf</max_output>"
+            f"<min_target>-inf</min_target><max_target>inf</max_target></{loop}>"
+            for loop in LOOPS
+        )
+        + "</group_gains>"
+    )
+    for own in read_gains(file, FACTORY):
+        check_gains(own)
+    write_gains(tmp_path / "out.xml", read_gains(file, FACTORY))
+    text = (tmp_path / "out.xml").read_text()
+    for name, value in (("i_clamp", "inf"), ("min_output", "-inf"), ("max_target", "inf")):
+        assert text.count(f"<{name}>{value} {value}</{name}>") == len(LOOPS)
+
+
+def test_a_gain_that_is_no_limit_cannot_be_infinite(file: Path) -> None:
+    file.write_text("<group_gains><position><kp>inf</kp></position></group_gains>")
+    with pytest.raises(WireError, match=r"kp 1e\+06 of the position loop; possible are -1000 \.\. 1000$"):
+        check_gains(read_gains(file, FACTORY)[0])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -71,6 +102,10 @@ def test_what_is_written_is_read_again(file: Path, tmp_path: Path) -> None:
         ("<group_gains><control_strategy>5</control_strategy></group_gains>", "control strategy '5'"),
         ("<group_gains><effort><i_clamp>-1</i_clamp></effort></group_gains>", "effort.i_clamp = -1.0"),
         ("<robot/>", "its root is <robot>"),
+        (
+            '<!DOCTYPE gains [<!ENTITY k "1">]><gains><position><kp>&k;</kp></position></gains>',
+            "a document type has no place in a gains file",
+        ),
         ("<group_gains>", "no gains file can be read"),
     ],
 )
@@ -108,8 +143,7 @@ def test_hebi_py_reads_our_files_and_we_read_its(tmp_path: Path) -> None:
 
 def _same(command: object, index: int, loop: str, gains: PidGains) -> None:
     for name, value in gains:
-        told = float(getattr(command, f"{loop}_{name}")[index])
-        told = min(max(told, -1e6), 1e6)
+        told = for_message(float(getattr(command, f"{loop}_{name}")[index]))
         assert told == pytest.approx(float(value), rel=1e-6), f"{loop}.{name}"
 
 
