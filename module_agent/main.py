@@ -152,7 +152,12 @@ def main(
     ] = 250.0,
     lifetime_ms: Annotated[float, typer.Option(min=1.0, max=1000.0, help="Command lifetime [ms].")] = 250.0,
     expiry: Annotated[str, typer.Option(help="On expiry: motor_off, hold or damping.")] = "motor_off",
-    strategy: Annotated[int, typer.Option(min=0, max=4, help="Control strategy at start.")] = 3,
+    strategy: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=4, help="Control strategy to begin with, and its factory gains [what modules have]."
+        ),
+    ] = None,
     secure: Annotated[
         Path | None,
         typer.Option(
@@ -235,7 +240,7 @@ def _run(
         with _usage_errors():
             modules: Modules
             if isinstance(source, HebiOptions):
-                modules = open_modules(source)
+                modules = open_modules(source, lambda text: typer.echo(f"x5-agent: {text}", err=True))
                 opened.callback(modules.close)
                 transport = open_transport([module.serial for module in modules.information])
                 opened.callback(transport.close)

@@ -3,8 +3,8 @@
 <group_gains><control_strategy>3 4</control_strategy><position><kp>0.5 15</kp></position></group_gains>
 
 Files may be partial, and their elements come in any order; one value stands for all modules. What a file does
-not say stays as it is. `inf` is no limit. Strategies are numbers; their names are read, though hebi-py refuses
-them.
+not say stays as it is. `inf` is no limit. Strategies are numbers; their names, which hebi-py refuses, are
+read.
 """
 
 import math

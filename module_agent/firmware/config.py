@@ -17,6 +17,7 @@ class FirmwareConfig(NamedTuple):
 
     imu: how well the module's IMU is calibrated, the prior of the module's own estimates.
     name, family: what the module's user calls it, and all modules of its robot.
+    strategy: the control strategy whose factory gains it begins with; None: the gains that the module has.
     safety: the configured limits, which `limits` has together with those of the type.
     """
 
@@ -31,7 +32,7 @@ class FirmwareConfig(NamedTuple):
     history_s: float = 60.0
     lifetime_ns: int = 250_000_000
     expiry_action: ExpiryAction = "motor_off"
-    strategy: int = 3
+    strategy: int | None = None
     imu: ImuKind = "uncalibrated"
     name: str = ""
     family: str = ""

@@ -103,7 +103,7 @@ class Firmware:
 
     Args:
         config: the settings.
-        modules: the modules of this process; gains and lifetime are set on construction.
+        modules: the modules of this process; the lifetime is set on construction, and gains if configured.
         index: which of them this is the firmware of.
 
     Raises:
@@ -140,8 +140,10 @@ class Firmware:
         self._status_due_ns = 0
         self._note = ""
         modules.set_lifetime(index, config.lifetime_ns)
-        self._kept_gains = default_gains(config.kind, config.strategy)
-        self._apply_gains(self._kept_gains)
+        self._gains = self._kept_gains = modules.information[index].gains
+        if config.strategy is not None:
+            self._kept_gains = default_gains(config.kind, config.strategy)
+            self._apply_gains(self._kept_gains)
 
     def step(self, sample: ModuleSample, inbox: Sequence[Incoming]) -> Command:
         """Begin a tick: expire what is stale, read the inbox; return the command for the module."""

@@ -170,8 +170,8 @@ class Modules(Protocol):
 
         A target of NaN switches its loop off, three of them the motor; `Command.brake` damps it.
 
-        HEBI: `send_command`, where a target is left out for NaN. No answer comes at once: the PWM is that of
-        the last feedback.
+        HEBI: `send_command`, where a target is left out for NaN; nothing before a first target. No answer
+        comes at once: the PWM is that of the last feedback.
 
         Raises:
             ValueError: not one command per module, or there was no sample yet.
@@ -180,7 +180,9 @@ class Modules(Protocol):
     def set_gains(self, index: int, gains: GainSet) -> None:
         """Replace the gains and the control strategy of a module; its loops forget their past.
 
-        HEBI: a command with gains; they are not saved, so that a power cycle brings back the owner's.
+        HEBI: a command with gains; they are not saved, so that a power cycle brings back the owner's. One
+        that has not followed a target yet, or has switched its motor off by itself, gets them with its first
+        target: given before, they would end the latch of its M-stop.
         """
 
     def set_lifetime(self, index: int, lifetime_ns: int) -> None:
@@ -201,7 +203,7 @@ class Modules(Protocol):
     def close(self) -> None:
         """Release the modules; their motors then are off. May be called twice.
 
-        HEBI: a last command without targets.
+        HEBI: a last command without targets, if the module may follow one.
         """
 
 

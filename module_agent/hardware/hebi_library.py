@@ -11,6 +11,9 @@ from contextlib import redirect_stdout
 from importlib import import_module
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from module_agent.model.errors import UsageError
 
 HEBI = "hebi"
@@ -112,6 +115,25 @@ def library(name: str = HEBI) -> Library:
             return import_module(name)
     except ImportError as error:
         raise UsageError(f"the library {name} cannot be imported ({error}); install it: {INSTALL}") from error
+
+
+def told_states(feedback: Any) -> Callable[[Any, str], NDArray[np.bool_]]:
+    """Return what says which modules have sent a state: called with a feedback like this one, and its name.
+
+    hebi-py reads a state that is not there as 0, such as "M-stop pressed", and has no public name that says
+    so; its messages have a bit for each field. What stands in for hebi-py sends all states.
+    """
+    internal = "hebi._internal.ffi"
+    if not type(feedback).__module__.startswith(internal):
+        return lambda answer, name: np.ones(len(getattr(answer, name)), np.bool_)
+    fields = import_module(f"{internal}._message_enums").FeedbackEnumField
+    first = import_module(f"{internal}._marshalling")._feedback_metadata.enum_field_bitfield_offset_
+
+    def told(answer: Any, name: str) -> NDArray[np.bool_]:
+        word, bit = divmod(first + fields[name.title().replace("_", "")].value, 32)
+        return np.array([ref.message_bitfield_[word] >> bit & 1 for ref in answer._refs], np.bool_)
+
+    return told
 
 
 def log_loader() -> Callable[[str], Any]:

@@ -3,6 +3,10 @@
 The loops run in the modules, which keep a command for HEBI's command lifetime: an agent that dies lets its
 modules expire by themselves. The driver paces itself: a tick is a feedback request, its answer and a command.
 What the modules send is checked as every sample is.
+
+A module is sent nothing until it is first to follow a target, which only the acquisition of its lease makes
+it. So it is again after it has switched its motor off by itself, at its M-stop or at a limit: HEBI's modules
+then keep strategy 0 until they are given another, which must be no side effect of the end of a lease.
 """
 
 import math
@@ -13,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V, Command
+from module_agent.control.gains import from_message
 from module_agent.hardware.hardware import (
     HardwareLost,
     LimitState,
@@ -20,10 +25,10 @@ from module_agent.hardware.hardware import (
     ModuleSample,
     SensorSample,
 )
-from module_agent.hardware.hebi_library import Group, Library
+from module_agent.hardware.hebi_library import Group, Library, told_states
 from module_agent.hardware.sample_check import MAX_HELD, SampleCheck
 from module_agent.model.catalogue import module_type
-from module_agent.wire.messages import GainSet, PidGains
+from module_agent.wire.messages import GainSet
 
 # A round trip takes 0.7 ms, 1.6 at most (measured on a real X5-1).
 FEEDBACK_TIMEOUT_MS = 20
@@ -49,11 +54,11 @@ _COLUMNS = [(SensorSample._fields.index(ours), hebi) for ours, hebi in FIELDS.it
 _GYRO = SensorSample._fields.index("gyro_x_rad_s")
 _ACCEL = SensorSample._fields.index("accel_x_m_s2")
 _IMU = slice(_GYRO, _ACCEL + 3)
-_VOLTAGE = SensorSample._fields.index("voltage_v")
+_POSITION, _VOLTAGE = (SensorSample._fields.index(name) for name in ("position_rad", "voltage_v"))
 
 # HEBI's values of the states of a module.
-_M_STOP_PRESSED = 0
-_INSIDE = 2
+_M_STOP_PRESSED, _M_STOP_RELEASED = 0, 1
+_BELOW, _AT_LOWER, _INSIDE, _AT_UPPER, _ABOVE = range(5)
 _TEMPERATURES = {1: LimitState.TEMPERATURE, 2: LimitState.OVER_TEMPERATURE, 3: LimitState.OVER_TEMPERATURE}
 _LIMIT_FIELDS = {
     "position_limit_state": LimitState.POSITION,
@@ -67,8 +72,8 @@ HELD_BY_OTHER = "another program commands this module (command_lifetime_state: L
 class HebiModules:
     """`Modules` over a HEBI group.
 
-    While all motors are off for longer than a lifetime nothing is sent, so that other programs can command
-    the modules.
+    Nothing is sent before a module is to follow a target, and while all motors are off for longer than a
+    lifetime, so that other programs can command the modules.
 
     Args:
         library: hebi-py, or what stands in for it.
@@ -96,7 +101,10 @@ class HebiModules:
         self._targets = np.full((count, 3), math.nan)
         self._lifetimes_ns = [250_000_000] * count
         self._readings = np.full((count, len(SensorSample._fields)), math.nan)
-        self._ticks = self._missed = self._off_ticks = self._unsent = 0
+        self._told = told_states(self._feedback)
+        self._ticks = self._missed = self._unsent = 0
+        # Since when all motors are off; before the first command there is nothing to repeat.
+        self._off_ticks: float = math.inf
         self._new_gains: set[int] = set()
         self._closed = False
         group.feedback_frequency = 0.0
@@ -124,9 +132,16 @@ class HebiModules:
         answer = self._group.get_next_feedback(timeout_ms=FEEDBACK_TIMEOUT_MS, reuse_fbk=self._feedback)
         if answer is None:
             self._missed += 1
+            alone = len(self._links) == 1
             if self._missed * FEEDBACK_TIMEOUT_MS >= 1e3 * LOST_AFTER_S:
-                raise HardwareLost(f"none of {self._names} has answered for {LOST_AFTER_S:g} s")
-            return [link.without_feedback() for link in self._links]
+                raise HardwareLost(
+                    f"{self._names} has not answered for {LOST_AFTER_S:g} s"
+                    if alone
+                    else f"{self._names} have not all answered for {LOST_AFTER_S:g} s; one that is silent is "
+                    "enough, as hebi-py gives the feedback of a group whole or not at all: x5-agent --hebi "
+                    "--list shows which answer"
+                )
+            return [link.without_feedback(of_group=not alone) for link in self._links]
         self._missed = 0
         return self._samples(answer)
 
@@ -142,16 +157,14 @@ class HebiModules:
                 f"{len(commands)} commands for {len(self._links)} modules, {self._ticks} ticks have been "
                 "read: receive a sample first, then send one command per module"
             )
-        self._targets[:] = [command[:3] for command in commands]
-        commanded = np.isfinite(self._targets).any(axis=1)
-        for index in np.flatnonzero(commanded).tolist():
-            self._end_m_stop(index, commands[index])
-        if self._new_gains:
-            self._send_gains()
-        active = bool(commanded.any())
+        for index, command in enumerate(commands):
+            self._take(index, command)
+        active = bool(np.isfinite(self._targets).any())
         self._off_ticks = 0 if active else self._off_ticks + 1
+        if any(not self._links[index].is_withheld for index in self._new_gains):
+            self._send_gains()
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
-        if active or self._off_ticks * self._information[0].tick_ns <= min(self._lifetimes_ns):
+        if active or self._may_follow:
             self._send_targets()
         return [link.pwm for link in self._links]
 
@@ -159,6 +172,7 @@ class HebiModules:
         """Replace the gains of a module until its next power cycle, with the next command that is sent.
 
         HEBI's messages have gains and targets together: sent now they would repeat targets that have expired.
+        A module that is sent nothing gets them with its first target.
         """
         self._new_gains.add(index)
         self._information[index] = self._information[index]._replace(gains=gains)
@@ -181,10 +195,12 @@ class HebiModules:
         self._group.send_command(command)
 
     def close(self) -> None:
-        """Send a last command without targets. May be called twice."""
+        """Send a last command without targets to modules that may follow one. May be called twice."""
         if self._closed:
             return
         self._closed = True
+        if not self._may_follow:
+            return
         self._targets[:] = math.nan
         for _ in range(_CONFIRM_TRIES):
             if self._group.send_command_with_acknowledgement(self._settings(), timeout_ms=_CONFIRM_MS):
@@ -194,6 +210,11 @@ class HebiModules:
     def _names(self) -> str:
         return ", ".join(link.serial for link in self._links)
 
+    @property
+    def _may_follow(self) -> bool:
+        """Whether the lifetime of the last target that was sent is not over."""
+        return self._off_ticks * self._information[0].tick_ns <= min(self._lifetimes_ns)
+
     def _samples(self, answer: Any) -> list[ModuleSample]:
         readings = self._readings
         for column, name in _COLUMNS:
@@ -202,8 +223,12 @@ class HebiModules:
         readings[:, _ACCEL : _ACCEL + 3] = answer.accelerometer
         pwm = np.nan_to_num(answer.pwm_command * readings[:, _VOLTAGE] / NOMINAL_VOLTAGE_V)
         times_us = answer.hardware_transmit_time_us.tolist()
-        limits = _limits(answer)
-        pressed = (answer.mstop_state == _M_STOP_PRESSED).tolist()
+        positions = self._states(answer, "position_limit_state", unset=_INSIDE).tolist()
+        limits = [_TEMPERATURES.get(state, LimitState.NONE) for state in answer.temperature_state.tolist()]
+        for name, flag in _LIMIT_FIELDS.items():
+            for index in np.flatnonzero(self._states(answer, name, unset=_INSIDE) != _INSIDE).tolist():
+                limits[index] |= flag
+        pressed = (self._states(answer, "mstop_state", unset=_M_STOP_RELEASED) == _M_STOP_PRESSED).tolist()
         locked = (answer.command_lifetime_state == _LOCKED_BY_OTHER).tolist()
         stamped_ns = None if self._stamp is None else self._stamp()
         samples = []
@@ -214,25 +239,40 @@ class HebiModules:
                 continue
             link.pwm = min(max(float(pwm[index]), -1.0), 1.0)
             link.limits, link.m_stop = limits[index], pressed[index]
-            link.is_off_after_m_stop |= pressed[index]
-            fault = HELD_BY_OTHER if locked[index] else ""
+            off = _off_at_limit(self._information[index], positions[index], row[_POSITION])
+            link.stays_off = bool(off) or (link.m_stop and link.m_stop_latches)
+            link.is_withheld |= link.stays_off
+            fault = off or (HELD_BY_OTHER if locked[index] else "")
             samples.append(link.with_feedback(t_ns, row, self._ticks, fault))
         return samples
 
-    def _end_m_stop(self, index: int, command: Command) -> None:
-        """Give a module that follows commands again the strategy back: its M-stop has left 0 behind."""
+    def _states(self, answer: Any, name: str, unset: int) -> NDArray[np.int32]:
+        """Return a state of all modules; `unset` for those that do not send it, which hebi-py reads as 0."""
+        states: NDArray[np.int32] = getattr(answer, name)
+        # Only a 0 may stand for what is not there.
+        return states if states.all() else np.where(self._told(answer, name), states, unset)
+
+    def _take(self, index: int, command: Command) -> None:
+        """Keep the target of a module, or none while it is sent nothing.
+
+        A target that is no brake comes from a lease that was acquired since the module switched itself off:
+        until then the firmware lets it rest, or brakes. The module gets its strategy back with its gains.
+        """
         link = self._links[index]
-        if link.is_off_after_m_stop and not link.m_stop and not command.brake:
-            link.is_off_after_m_stop = False
-            self.set_gains(index, self._information[index].gains)
+        follows = not command.brake and any(map(math.isfinite, command[:3]))
+        if link.is_withheld and follows and not link.stays_off:
+            link.is_withheld = False
+            self._new_gains.add(index)
+        self._targets[index] = math.nan if link.is_withheld else command[:3]
 
     def _send_gains(self) -> None:
         command = self._settings()
-        for index in self._new_gains:
+        given = sorted(index for index in self._new_gains if not self._links[index].is_withheld)
+        for index in given:
             write_gains(command[index], self._information[index].gains)
-        names = ", ".join(self._links[index].serial for index in sorted(self._new_gains))
+        names = ", ".join(self._links[index].serial for index in given)
         self._confirmed(command, f"the gains of {names}")
-        self._new_gains.clear()
+        self._new_gains.difference_update(given)
 
     def _send_targets(self) -> None:
         self._write_targets(self._command)
@@ -265,7 +305,11 @@ class HebiModules:
 
 
 class _Link:
-    """What the driver remembers of one module: its last sample, and what it last told of its drive."""
+    """What the driver remembers of one module: its last sample, and what it last told of its drive.
+
+    stays_off: it holds its motor off by itself, at its M-stop or at a limit. is_withheld: it is sent neither
+    targets nor gains until it is to follow a target. m_stop_latches: the M-stop leaves its motor off.
+    """
 
     def __init__(self, information: ModuleInformation):
         self.serial = information.serial
@@ -273,7 +317,9 @@ class _Link:
         self.pwm = 0.0
         self.limits = LimitState.NONE
         self.m_stop = False
-        self.is_off_after_m_stop = False
+        self.m_stop_latches = information.safety.m_stop not in ("hold", "disabled")
+        self.stays_off = False
+        self.is_withheld = True
         self._check = SampleCheck(module_type(information.module_type))
         self._sequence = 0
         self._misses = 0
@@ -297,15 +343,16 @@ class _Link:
         self._fault = self._restarted or self._check.fault or fault
         return self._sample(self._fault)
 
-    def without_feedback(self) -> ModuleSample:
+    def without_feedback(self, of_group: bool = False) -> ModuleSample:
         """Return the sample of a tick without feedback: the last one, later by next to nothing.
 
         A time that overtook the module's clock would let that go back with the next feedback.
         """
         self._misses += 1
         self._last = self._last._replace(t_ns=self._last.t_ns + 1)
+        whose = " of the whole group, in which one module may be silent" if of_group else ""
         return self._sample(
-            f"no feedback in {self._misses} ticks" if self._misses > MAX_HELD else self._fault
+            f"no feedback in {self._misses} ticks{whose}" if self._misses > MAX_HELD else self._fault
         )
 
     def _sample(self, fault: str) -> ModuleSample:
@@ -316,20 +363,20 @@ def _sensors(t_ns: int, imu_t_ns: int, row: list[float]) -> SensorSample:
     return SensorSample(t_ns, imu_t_ns, *row[2:])
 
 
-def _limits(answer: Any) -> list[LimitState]:
-    """Return what acts on each module, by its four states."""
-    states = [_TEMPERATURES.get(state, LimitState.NONE) for state in answer.temperature_state.tolist()]
-    for name, flag in _LIMIT_FIELDS.items():
-        outside: NDArray[np.bool_] = getattr(answer, name) != _INSIDE
-        for index in np.flatnonzero(outside):
-            states[index] |= flag
-    return states
+def _off_at_limit(module: ModuleInformation, state: int, position_rad: float) -> str:
+    """Return at which limit of position a module has switched its motor off, "" if at none."""
+    sides = (_BELOW, _AT_LOWER), (_AT_UPPER, _ABOVE)
+    limits = module.limits.min_position_rad, module.limits.max_position_rad
+    for side, limit, action in zip(sides, limits, module.safety.at_limit, strict=True):
+        if action == "motor_off" and state in side:
+            return f"position {position_rad:.3f} rad: motor off at the limit {limit:g} rad"
+    return ""
 
 
 def write_gains(command: Any, gains: GainSet) -> None:
     """Write gains into one module's part of a command."""
     command.control_strategy = gains.strategy
     for loop in ("position", "velocity", "effort"):
-        own: PidGains = getattr(gains, loop)
-        for name in PidGains.model_fields:
-            setattr(command, f"{loop}_{name}", getattr(own, name))
+        for name, value in getattr(gains, loop):
+            own = value if isinstance(value, bool) else from_message(value)
+            setattr(command, f"{loop}_{name}", own)

@@ -7,14 +7,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from pydantic import ValidationError
 
-from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.control.gains import catalogue_limits, default_gains, for_message
 from module_agent.control.safety import UNCONFIGURED, LimitAction, MStopAction, Safety
 from module_agent.control.safety_file import XML_FIELDS, read_safety
 from module_agent.hardware.hardware import HardwareLost, ModuleInformation
 from module_agent.hardware.hebi_library import HEBI, Group, Library, library, names_of
 from module_agent.hardware.hebi_modules import HebiModules
+from module_agent.hardware.loop_inside import DEFAULT_STRATEGY
 from module_agent.model.catalogue import CATALOGUE, ModuleType, module_type
 from module_agent.model.errors import UsageError
 from module_agent.wire.keys import check_chunk
@@ -24,7 +26,6 @@ from module_agent.wire.messages import GainSet, Limits, PidGains
 LOOKUP_S = 2.0
 MIN_RATE_HZ, MAX_RATE_HZ = 50.0, 1000.0
 _TIMEOUT_MS = 1000
-_MAX_GAIN = 1e6
 # HEBI's values of what happens at a limit of position, and while the emergency stop is pressed.
 AT_LIMIT: dict[LimitAction, int] = {"hold": 0, "spring": 1, "motor_off": 2, "disabled": 3}
 AT_M_STOP: dict[MStopAction, int] = {"disabled": 0, "motor_off": 1, "hold": 2}
@@ -45,8 +46,12 @@ class HebiOptions(NamedTuple):
     library: str = HEBI
 
 
-def open_modules(options: HebiOptions) -> HebiModules:
-    """Find modules on the network and return their driver, in real time.
+def _no_note(text: str) -> None:
+    """Say nothing."""
+
+
+def open_modules(options: HebiOptions, note: Callable[[str], None] = _no_note) -> HebiModules:
+    """Find modules on the network and return their driver, in real time; see `describe` for notes.
 
     Raises:
         UsageError: hebi-py or a module is missing, or an option or a limit cannot be.
@@ -54,7 +59,7 @@ def open_modules(options: HebiOptions) -> HebiModules:
     """
     hebi = library(options.library)
     group = find_group(hebi, options.family, options.names)
-    information = describe(hebi, group, options.rate_hz, options.types)
+    information = describe(hebi, group, options.rate_hz, options.types, note)
     if options.safety is not None:
         limits = read_safety(options.safety, [module.serial for module in information])
         information = restrict(hebi, group, information, list(limits.values()))
@@ -113,9 +118,13 @@ def find_group(
 
 
 def describe(
-    hebi: Library, group: Group, rate_hz: float, types: Sequence[str] = ()
+    hebi: Library,
+    group: Group,
+    rate_hz: float,
+    types: Sequence[str] = (),
+    note: Callable[[str], None] = _no_note,
 ) -> list[ModuleInformation]:
-    """Return what the modules of a group tell of themselves.
+    """Return what the modules of a group tell of themselves: their own gains and limits among it.
 
     Accelerometers are made to read specific force: the setting is not saved in the module.
 
@@ -124,6 +133,7 @@ def describe(
         group: the modules.
         rate_hz: ticks a second.
         types: of the modules in their order, if they are not to be asked.
+        note: is told which gains a module does not tell, and gets from the factory.
 
     Raises:
         HardwareLost: they do not answer, or an accelerometer cannot be made to read gravity.
@@ -136,7 +146,7 @@ def describe(
     info = _info(group)
     if not info.accel_includes_gravity.all():
         info = _with_gravity(hebi, group)
-    return [_described(info, index, rate_hz, types) for index in range(group.size)]
+    return [_described(info, index, rate_hz, types, note) for index in range(group.size)]
 
 
 def _info(group: Group) -> Any:
@@ -160,14 +170,19 @@ def _with_gravity(hebi: Library, group: Group) -> Any:
     return info
 
 
-def _described(info: Any, index: int, rate_hz: float, types: Sequence[str]) -> ModuleInformation:
+def _described(
+    info: Any, index: int, rate_hz: float, types: Sequence[str], note: Callable[[str], None]
+) -> ModuleInformation:
     name, family, serial = (names_of(values)[index] for values in (info.name, info.family, info.serial))
     check_chunk("serial", serial)
     told = types[index] if types else names_of(info.mechanical_type)[index]
     kind = module_type(_type_name(told, serial))
     tick_ns = round(1e9 / rate_hz)
-    gains, limits = _gains(info, index, kind), _limits(info, index, kind)
-    return ModuleInformation(serial, name, family, kind.name, gains, limits, tick_ns, tick_ns)
+    gains, from_factory = _gains(info, index, kind)
+    if from_factory:
+        note(f"module {serial} {from_factory}")
+    limits, safety = _limits(info, index, kind)
+    return ModuleInformation(serial, name, family, kind.name, gains, limits, tick_ns, tick_ns, safety)
 
 
 def restrict(
@@ -208,9 +223,17 @@ def restrict(
             if not math.isclose(told := float(getattr(info, name)[index]), value, rel_tol=1e-6):
                 raise HardwareLost(f"module {module.serial} does not take {name} {value:g}, it has {told:g}")
     return [
-        module._replace(limits=own, safety=one)
+        module._replace(limits=own, safety=_in_force(one, own, module.safety))
         for module, one, own in zip(information, safety, limits, strict=True)
     ]
+
+
+def _in_force(safety: Safety, limits: Limits, before: Safety) -> Safety:
+    """Return a configuration with what happens at each limit: at a narrower one of its own, as before."""
+    own = limits.min_position_rad, limits.max_position_rad
+    sides = zip(safety.range_rad, own, safety.at_limit, before.at_limit, strict=True)
+    at_limit = tuple(action if limit == tight else kept for limit, tight, action, kept in sides)
+    return safety.model_copy(update={"at_limit": at_limit})
 
 
 def _settings(safety: Safety, limits: Limits, before: Limits) -> Iterator[tuple[str, float]]:
@@ -248,39 +271,61 @@ def _type_name(told: str, serial: str) -> str:
     )
 
 
-def _limits(info: Any, index: int, kind: ModuleType) -> Limits:
-    """Return the type's limits, or the module's own where they are narrower."""
+def _limits(info: Any, index: int, kind: ModuleType) -> tuple[Limits, Safety]:
+    """Return the type's limits, or the module's own where they are narrower, and what happens at its own."""
     limits = catalogue_limits(kind)
-    low, high = float(info.position_limit_min[index]), float(info.position_limit_max[index])
-    position = {}
+    sides = [(side, float(getattr(info, f"position_limit_{side}")[index])) for side in ("min", "max")]
+    position, at_limit = {}, list(UNCONFIGURED.at_limit)
     # One that a module does not tell is NaN.
-    if not low >= high:
-        if info.min_position_limit_strategy[index] != AT_LIMIT["disabled"] and math.isfinite(low):
-            position["min_position_rad"] = low
-        if info.max_position_limit_strategy[index] != AT_LIMIT["disabled"] and math.isfinite(high):
-            position["max_position_rad"] = high
+    if not sides[0][1] >= sides[1][1]:
+        for place, (side, limit) in enumerate(sides):
+            action = getattr(info, f"{side}_position_limit_strategy")[index]
+            if action != AT_LIMIT["disabled"] and math.isfinite(limit):
+                position[f"{side}_position_rad"] = limit
+                if action == AT_LIMIT["motor_off"]:
+                    at_limit[place] = "motor_off"
     most = {}
     for field, name in (("max_speed_rad_s", "velocity"), ("max_effort_nm", "effort")):
         own = (abs(float(getattr(info, f"{name}_limit_{side}")[index])) for side in ("min", "max"))
         most[field] = min([getattr(limits, field), *(value for value in own if value > 0.0)])
-    return limits.model_copy(update=position | most)
+    return limits.model_copy(update=position | most), UNCONFIGURED.model_copy(
+        update={"at_limit": tuple(at_limit)}
+    )
 
 
-def _gains(info: Any, index: int, kind: ModuleType) -> GainSet:
-    """Return the gains in force; the factory's where a module does not tell one."""
+def _gains(info: Any, index: int, kind: ModuleType) -> tuple[GainSet, str]:
+    """Return the gains that a module has, and which are the factory's as it does not tell them, "" if none.
+
+    Strategy 0 is what an M-stop leaves behind, and what hebi-py reads where a module tells none: which
+    strategy its gains are for is not known then.
+    """
     strategy = int(info.control_strategy[index])
-    factory = default_gains(kind, strategy if 0 <= strategy <= 4 else 0)
-    loops = {}
+    if strategy not in range(1, 5):
+        return default_gains(kind, DEFAULT_STRATEGY), (
+            f"has control strategy {strategy}, as after an M-stop: with its first lease it gets the factory "
+            f"gains of its type for strategy {DEFAULT_STRATEGY}, in place of its owner's"
+        )
+    factory = default_gains(kind, strategy)
+    loops, unknown = {}, []
     for loop in ("position", "velocity", "effort"):
-        values = {name: float(getattr(info, f"{loop}_{name}")[index]) for name in PidGains.model_fields}
-        # HEBI's infinite limits are a million here.
-        known = {k: min(max(v, -_MAX_GAIN), _MAX_GAIN) for k, v in values.items() if not math.isnan(v)}
-        known["d_on_error"] = bool(values["d_on_error"])
+        told = {name: _told_gain(getattr(info, f"{loop}_{name}")[index]) for name in PidGains.model_fields}
+        known = {name: value for name, value in told.items() if value is not None}
         try:
             loops[loop] = PidGains.model_validate(getattr(factory, loop).model_dump() | known)
+            unknown += [f"{loop}_{name}" for name in told if name not in known]
         except ValidationError:
             loops[loop] = getattr(factory, loop)
-    return GainSet(strategy=factory.strategy, **loops)
+            unknown.append(f"{loop}_*")
+    used = f"does not tell {', '.join(unknown)}: with its first lease it gets the factory's"
+    return GainSet(strategy=strategy, **loops), used if unknown else ""
+
+
+def _told_gain(value: Any) -> float | bool | None:
+    """Return one gain of an information message; None for what a module does not tell."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    # Of single precision: 0.1 is 0.1 and not 0.100000001.
+    return None if math.isnan(value) else for_message(float(str(value)))
 
 
 class Pace:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from module_agent.control.controller import MOTOR_OFF, NOMINAL_VOLTAGE_V, Command
-from module_agent.control.gains import default_gains
+from module_agent.control.gains import default_gains, for_message, from_message
 from module_agent.control.safety import UNCONFIGURED, Safety
 from module_agent.hardware.hardware import (
     LimitState,
@@ -28,7 +28,7 @@ _SAFETY = [
     *("min_position_limit_strategy", "max_position_limit_strategy", "mstop_strategy"),
 ]
 UNLOCKED, LOCKED_BY_OTHER, LOCKED_BY_SENDER = 0, 1, 2
-_INSIDE, _AT_UPPER = 2, 3
+_AT_LOWER, _INSIDE, _AT_UPPER = 1, 2, 3
 _AT_LIMIT = {value: action for action, value in AT_LIMIT.items()}
 _AT_M_STOP = {value: action for action, value in AT_M_STOP.items()}
 # Readings before the first tick: at rest, with z up.
@@ -65,6 +65,8 @@ class NetworkModule:
         self.type = module.module_type
         self.accel_includes_gravity = True
         self.m_stop = self.silent = False
+        # Whether the motor was held off by the module itself in the last tick.
+        self._is_stopped = False
         self.led: Color | None = None
         self.sample = self._loops.take(0, _NOTHING)
         self._targets: Command | None = None
@@ -81,12 +83,13 @@ class NetworkModule:
         """Run the loops on what is read; return the PWM."""
         self._wires.reading = reading
         (self.sample,) = self._loops.receive()
-        if self.m_stop and self._safety.m_stop == "motor_off":
-            # HEBI's MotorOff: strategy 0 until the user sets another one.
-            if self.gains.strategy:
-                self._loops.set_gains(0, default_gains(self._kind, 0))
+        was_stopped = self._is_stopped
+        self._is_stopped = (self.m_stop and self._safety.m_stop == "motor_off") or self._is_off_at_limit
+        if self._is_stopped and not was_stopped:
+            # HEBI's MotorOff: strategy 0, which stays until the user sets another one.
+            self._loops.set_gains(0, default_gains(self._kind, 0))
             self._targets = MOTOR_OFF
-        elif self.m_stop and self._safety.m_stop == "hold":
+        if self.m_stop and self._safety.m_stop == "hold":
             self._targets = self._held = self._held or Command(reading.position_rad, math.nan, math.nan)
         else:
             self._held = None
@@ -96,6 +99,10 @@ class NetworkModule:
             # A command lives on by HEBI's lifetime, not by that of the loops.
             self._loops.send([self._targets])
         return self._loops.pwm[0]
+
+    @property
+    def _is_off_at_limit(self) -> bool:
+        return "motor off at the limit" in self.sample.fault
 
     def command(self, sender: object, lifetime_ms: int, command: GroupCommand, index: int) -> bool:
         """Take one module's part of a command; return whether the module heard it."""
@@ -117,7 +124,8 @@ class NetworkModule:
             own = self.gains.model_dump()
             for loop in LOOPS:
                 names = [name for name in PidGains.model_fields if f"{loop}_{name}" in written]
-                own[loop] |= {name: getattr(command, f"{loop}_{name}")[index].item() for name in names}
+                told = {name: getattr(command, f"{loop}_{name}")[index].item() for name in names}
+                own[loop] |= {k: v if isinstance(v, bool) else for_message(v) for k, v in told.items()}
             own["strategy"] = int(command.control_strategy[index])
             self._loops.set_gains(0, GainSet.model_validate(own))
         if safety := {name: getattr(command, name)[index].item() for name in _SAFETY if name in written}:
@@ -166,9 +174,16 @@ class NetworkModule:
         feedback.temperature_state[index] = (
             2 if LimitState.OVER_TEMPERATURE in acting else int(LimitState.TEMPERATURE in acting)
         )
+        low, high = self._safety.range_rad
+        position_rad = sample.sensors.position_rad
+        at = _AT_LOWER if position_rad - low < high - position_rad else _AT_UPPER
+        if self._safety.at_limit[at == _AT_UPPER] == "motor_off":
+            # Before this limit the motor is slowed down, which HEBI's modules do not say.
+            acting &= ~LimitState.POSITION
+            acting |= LimitState.POSITION if self._is_off_at_limit else LimitState.NONE
         for name in LOOPS:
             flag = LimitState[name.upper()]
-            getattr(feedback, f"{name}_limit_state")[index] = _AT_UPPER if flag in acting else _INSIDE
+            getattr(feedback, f"{name}_limit_state")[index] = at if flag in acting else _INSIDE
 
     def write_info(self, info: GroupInfo, index: int) -> None:
         """Write what this module tells of itself."""
@@ -179,7 +194,7 @@ class NetworkModule:
         for loop in LOOPS:
             own: PidGains = getattr(self.gains, loop)
             for name in PidGains.model_fields:
-                getattr(info, f"{loop}_{name}")[index] = getattr(own, name)
+                getattr(info, f"{loop}_{name}")[index] = from_message(getattr(own, name))
         safety, limits = self._safety, self._loops.information[0].limits
         told = limits.min_position_rad, limits.max_position_rad
         for side, value, action in zip(("min", "max"), told, safety.at_limit, strict=True):

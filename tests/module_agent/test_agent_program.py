@@ -96,7 +96,7 @@ def test_modules_on_hebis_network_are_listed_by_family_and_name(
 
 
 def test_modules_that_do_not_answer_at_the_start_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    def silent(options: object) -> None:
+    def silent(options: object, note: object) -> None:
         raise HardwareLost("a module does not tell its settings within 1000 ms")
 
     monkeypatch.setattr("module_agent.main.open_modules", silent)
