@@ -326,18 +326,9 @@ class ModuleGroup:
         # Not the modules whose lease another coordinator has taken.
         held = [serial for serial in self._tokens if serial not in self._taken_by]
         self._tokens.clear()
-        done = await asyncio.gather(*(self._stop(serial, why) for serial in held), return_exceptions=True)
+        stops = (stop_module(self._messenger, self.sender, serial, why) for serial in held)
+        done = await asyncio.gather(*stops, return_exceptions=True)
         return [s for s, r in zip(held, done, strict=True) if isinstance(r, BaseException)]
-
-    async def _stop(self, serial: str, why: str) -> None:
-        for left in reversed(range(3)):
-            stop = self._request(Stop, serial, why=why)
-            try:
-                await self._messenger.command(serial, Leaf.STOP, stop, timeout_s=0.3)
-                return
-            except NoAnswer:
-                if not left:
-                    raise
 
     # ------------------------------------------------------------------ motions
 
@@ -505,6 +496,22 @@ class ModuleGroup:
             if await self.wait(lambda: received() is not None, 0.3):
                 break
         return received()
+
+
+async def stop_module(messenger: Messenger, sender: str, serial: str, why: str) -> None:
+    """Stop a module, whichever program holds its lease; a network may lose the first two stops or answers.
+
+    Raises:
+        NoAnswer, Refused: it does not confirm.
+    """
+    for left in reversed(range(3)):
+        stop = Stop(serial=serial, boot=0, seq=messenger.next_seq(), sender=sender, why=why)
+        try:
+            await messenger.command(serial, Leaf.STOP, stop, timeout_s=0.3)
+            return
+        except NoAnswer:
+            if not left:
+                raise
 
 
 def _unfinished(motion: MotionRecord | None) -> str:

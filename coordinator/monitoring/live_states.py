@@ -5,11 +5,11 @@ from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Sender, gather_all
-from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.live_robot.module_group import ModuleGroup, stop_module
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from module_agent.model.errors import RobotError
 from module_agent.wire.keys import Leaf
-from module_agent.wire.messages import Ask, Identify, Stop
+from module_agent.wire.messages import Ask, Identify
 
 # Period of the updates, and of the requests to every module, which are round trips for its clock as well.
 UPDATE_S, ASK_S = 0.25, 0.5
@@ -41,6 +41,7 @@ class LiveStates:
         self._keeper: asyncio.Task[None] | None = None
         self._lit: str | None = None
         self._work: set[asyncio.Task[None]] = set()
+        self._holding: asyncio.Task[None] | None = None
 
     @property
     def holds(self) -> bool:
@@ -64,18 +65,24 @@ class LiveStates:
             await self._give_back_led()
 
     def stop(self) -> None:
-        """Stop every module at once; what was held is held no longer."""
+        """Stop every module at once; what is held, or is being taken, is released."""
+        # An acquisition that came after the stop would arm its module again.
+        if self._holding is not None:
+            self._holding.cancel()
         self._do(self._stop())
 
     def hold(self) -> None:
         """Take the leases, so that every module holds its position; the second time, release them."""
-        self._do(self._release() if self.holds else self._hold())
+        if self.holds:
+            self._do(self._release())
+        else:
+            self._holding = self._do(self._hold())
 
     def light(self) -> None:
         """Light the LED of the next module by serial, so that it is found; after the last one none is lit."""
         self._do(self._light_next())
 
-    def _do(self, work: Coroutine[None, None, None]) -> None:
+    def _do(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
         async def attempt() -> None:
             try:
                 await work
@@ -85,22 +92,12 @@ class LiveStates:
         task = asyncio.create_task(attempt())
         self._work.add(task)
         task.add_done_callback(self._work.discard)
+        return task
 
     async def _stop(self) -> None:
         serials = sorted(self._messenger.alive)
-
-        async def one(serial: str) -> None:
-            stop = Stop(
-                serial=serial,
-                boot=0,
-                seq=self._messenger.next_seq(),
-                sender=self._sender.name,
-                why="asked to",
-            )
-            await self._messenger.command(serial, Leaf.STOP, stop)
-
         try:
-            await gather_all(one(serial) for serial in serials)
+            await gather_all(stop_module(self._messenger, self._sender.name, s, "asked to") for s in serials)
             self._note(f"stopped: {', '.join(serials) or 'no module is there'}")
         finally:
             await self._release()

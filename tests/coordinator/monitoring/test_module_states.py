@@ -208,6 +208,38 @@ def test_a_key_stops_all_modules_also_those_that_another_program_holds(follower:
     assert follower.notes == ["stopped: X-00009, X-00010"]
 
 
+@pytest.mark.parametrize("after_s", [0.0, 0.0005, 0.001, 0.002, 0.004])
+def test_a_stop_while_the_leases_are_being_taken_stops_all_modules_for_good(
+    follower: Follower, after_s: float
+) -> None:
+    """Whichever of the acquisitions is under way, none may arm a module after the stop."""
+    follower.rig.at(1.0, follower.live.hold)
+    follower.rig.at(1.0 + after_s, follower.live.stop)
+    follower.follow(3.0)
+    assert [follower.rig.state(serial) for serial in follower.rig.serials] == ["stopped", "stopped"]
+    assert not follower.live.holds
+    assert not any(note.startswith("held") for note in follower.notes)
+
+
+def test_a_stop_that_the_network_loses_is_sent_again(
+    follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost: list[str] = []
+    query = follower.messenger._transport.query
+
+    def losing(at: str, payload: bytes, timeout_s: float, sink: Any, tag: int) -> None:
+        is_lost = at.endswith(Leaf.STOP.value) and lost.count(at) < 2
+        if is_lost:
+            lost.append(at)
+        query(f"{at}-lost" if is_lost else at, payload, timeout_s, sink, tag)
+
+    monkeypatch.setattr(follower.messenger._transport, "query", losing)
+    follower.rig.at(1.0, follower.live.stop)
+    follower.follow(3.0)
+    assert len(lost) == 4
+    assert [follower.rig.state(serial) for serial in follower.rig.serials] == ["stopped", "stopped"]
+
+
 def test_a_key_lights_one_led_after_the_other_and_the_end_of_the_table_the_last(follower: Follower) -> None:
     lit: list[list[str]] = []
     modules = [host.modules[0].firmware.config.serial for host in follower.rig.hosts.values()]
