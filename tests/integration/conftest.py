@@ -45,7 +45,8 @@ ROOT = Path(__file__).parents[2]
 # No test waits this long unless it fails: the machine may be slow and shared.
 LIMIT_S = 90.0
 MARK = "X5_INTEGRATION_TEST"
-# All of these tests over the driver of real modules and what stands in for hebi-py; by default a few are.
+# All of these tests over the driver of real modules and what stands in for hebi-py; by default those that
+# take `through_driver` are, once with it and once without.
 THROUGH_THE_DRIVER = "X5_TEST_HEBI" in os.environ
 
 # A whole session in 14 s (27 s with dynamics): shorter motions, everything else as shipped.
@@ -177,6 +178,12 @@ def plan(tmp_path: Path) -> Path:
     path = tmp_path / "short.toml"
     path.write_text(SHORT_PLAN)
     return path
+
+
+@pytest.fixture(params=[False, True], ids=["loops", "driver"])
+def through_driver(request: pytest.FixtureRequest) -> bool:
+    """Whether the agents speak to their modules through the driver of real ones."""
+    return bool(request.param)
 
 
 @pytest.fixture

@@ -47,8 +47,10 @@ def grown(commander, serials: tuple[str, ...], before: dict[str, Counter[str]]) 
     return {s: Counter(commander.status(s).refusals) - before[s] for s in serials}
 
 
-def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, client, programs) -> None:
-    robot = launcher()
+def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(
+    launcher, client, programs, through_driver
+) -> None:
+    robot = launcher(hebi=through_driver)
     commander = client(robot.config.robot_name, hub=True)
     robot.start_world()
     agents = robot.start_agents()
@@ -68,8 +70,10 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
         release = commander.ask(serial, Leaf.LEASE, commander.lease_message(serial, "release"), commander.Ack)
         assert release.accepted
 
-    code, said = programs.ended(robot.start_coordinator(quiet=True))
-    assert code == 0, said
+    # Through the driver the robot identifies itself in virtual time (tests/simulation).
+    if not through_driver:
+        code, said = programs.ended(robot.start_coordinator(quiet=True))
+        assert code == 0, said
     robot.stop()
     truth = read_motion(robot.config.out / "truth.npz")
     for index, serial in enumerate(truth.serials):
@@ -77,7 +81,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
         during = (clock >= began[serial].t_ns) & (clock <= now[serial].t_ns)
         # Held still: what is left is the hold's own noise.
         assert np.ptp(truth.q_rad[during, index]) < 1e-3
-    assert score(robot.config.out).topology_correct
+    assert through_driver or score(robot.config.out).topology_correct
 
 
 def throw_all(

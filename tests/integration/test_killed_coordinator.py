@@ -11,9 +11,11 @@ from sim.scoring.score import score
 EXPIRED = STATE_NAMES.index("expired")
 
 
-def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(launcher, client) -> None:
+def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(
+    launcher, client, through_driver
+) -> None:
     """The hub outlives the coordinator here, so that the instant of the last accepted command is heard."""
-    robot = launcher(lifetime_ms=500)
+    robot = launcher(lifetime_ms=500, hebi=through_driver)
     config = robot.config
     ear = client(config.robot_name, hub=True)
     robot.start_world()

@@ -40,9 +40,9 @@ def test_ctrl_c_stops_everything_and_keeps_what_was_recorded(
 
 
 def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
-    launcher, client, programs
+    launcher, client, programs, through_driver
 ) -> None:
-    robot = launcher()
+    robot = launcher(hebi=through_driver)
     config = robot.config
     robot.start_world()
     # A long session: it must not come to its end by itself before it is stopped.

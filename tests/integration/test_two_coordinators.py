@@ -5,9 +5,9 @@ from sim.scoring.score import score
 
 
 def test_the_second_coordinator_is_told_who_holds_the_robot_and_disturbs_nothing(
-    launcher, client, programs, plan, tmp_path
+    launcher, client, programs, plan, tmp_path, through_driver
 ) -> None:
-    robot = launcher()
+    robot = launcher(hebi=through_driver)
     config = robot.config
     robot.start_world()
     # The other one's start may take ten seconds on a busy machine.
