@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from module_agent.control.gains import catalogue_limits
+from module_agent.control.gains import catalogue_limits, default_gains
 from module_agent.control.motion import effort_profile
 from module_agent.control.safety import Safety
 from module_agent.firmware.admission import Lease
 from module_agent.firmware.config import FirmwareConfig, check_config
-from module_agent.firmware.firmware import Incoming, Publication, acknowledgement
+from module_agent.firmware.firmware import Firmware, Incoming, Publication, acknowledgement
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
 from module_agent.firmware.tick_kernel import BRAKE, FOLLOW, MOTION
 from module_agent.hardware.hardware import SensorSample
@@ -1049,3 +1049,15 @@ def test_quiet_ticks_brake_while_stopped_unless_the_motor_is_to_be_off(
     bench.m_stop = False
     bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="me"))
     assert told(bench)[0] == BRAKE
+
+
+def test_a_firmware_begins_with_the_gains_of_its_module_unless_a_strategy_is_configured() -> None:
+    bench = Bench()
+    modules, config = bench._wired.modules, bench.firmware.config
+    own = default_gains(config.kind, 4)
+    modules.set_gains(0, own)
+    assert Firmware(config, modules)._info().gains == own
+    assert modules.information[0].gains == own
+    other = default_gains(config.kind, 2)
+    assert Firmware(config._replace(strategy=2), modules)._info().gains == other
+    assert modules.information[0].gains == other
