@@ -1,6 +1,6 @@
 """Gains files and LEDs by the commands, over the driver of real modules."""
 
-from module_agent.control.gains import default_gains
+from module_agent.control.gains import UNLIMITED, default_gains
 from module_agent.control.gains_file import read_gains, write_gains
 from module_agent.model.catalogue import module_type
 
@@ -14,8 +14,12 @@ def test_gains_are_shown_loaded_and_saved_and_a_module_is_found_by_its_led(
     robot.start_world()
     commander.meet(serials, *robot.start_agents())
     at = ("--robot", name, "--listen", robot.config.endpoint, "--expect", str(len(serials)))
-    stiff = [default_gains(module_type("X5-4"), 4)] * len(serials)
+    factory = default_gains(module_type("X5-4"), 4)
+    # As in HEBI's own files, a limit may be none.
+    free = {"min_output": -UNLIMITED, "max_output": UNLIMITED, "i_clamp": UNLIMITED}
+    stiff = [factory.model_copy(update={"effort": factory.effort.model_copy(update=free)})] * len(serials)
     write_gains(tmp_path / "stiff.xml", stiff)
+    assert "<max_output>inf inf</max_output>" in (tmp_path / "stiff.xml").read_text()
 
     loaded = programs.run("coordinator.main", "gains", "load", str(tmp_path / "stiff.xml"), *at)
     assert loaded.returncode == 0, loaded.stderr
