@@ -73,6 +73,14 @@ def rigs(physics: str | None) -> Iterator[Callable[..., Any]]:
 
 
 @pytest.fixture
+def page_port() -> int:
+    """A free port of 127.0.0.1, the next one free too: those of the kernel's choice are seldom neighbours."""
+    from coordinator.viewer.viewer_process import free_port, listens
+
+    return next(port for port in iter(free_port, 0) if not listens("127.0.0.1", port + 1))
+
+
+@pytest.fixture
 def known_folder(tmp_path: Path) -> Callable[..., Path]:
     """Makes the folder of a run that found out without error what a robot is and weighs."""
 

@@ -43,6 +43,13 @@ JsonFile = Annotated[
 WithReport = Annotated[
     bool, typer.Option("--report/--no-report", help="Write a page for people, report.html, into the folder.")
 ]
+LiveViewer = Annotated[
+    str, typer.Option(help="Live viewer: none, spawn, serve (to a browser), or a rerun+http:// address.")
+]
+ServePort = Annotated[
+    int,
+    typer.Option(min=1, max=65534, help="With --viewer serve, port of the page; the next one has the data."),
+]
 Secure = Annotated[
     Path | None,
     typer.Option(

@@ -7,7 +7,16 @@ from typing import Annotated
 import typer
 
 from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, measured_before_run
-from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed, WithReport
+from coordinator.commands.options import (
+    ConnectOptions,
+    Expect,
+    LiveViewer,
+    PlanOptions,
+    ServePort,
+    Speed,
+    WithReport,
+)
+from coordinator.commands.view import live_page
 from coordinator.identification.identify import identify
 from coordinator.identification.result import DynamicsPart, Result
 from coordinator.live_robot.connection import Place, new_sender, open_connection
@@ -43,12 +52,8 @@ def run(
             "the prior of their IMUs; repeat for several."
         ),
     ] = None,
-    viewer: Annotated[
-        str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
-    ] = "none",
-    serve_port: Annotated[
-        int, typer.Option(min=1, max=65534, help="Port of the viewer served to a browser.")
-    ] = SERVE_PORT,
+    viewer: LiveViewer = "none",
+    serve_port: ServePort = SERVE_PORT,
     max_disk: Annotated[
         float, typer.Option(min=1e-3, help="End, the robot stopped, when the recording has so many GB.")
     ] = 20.0,
@@ -61,6 +66,7 @@ def run(
 ) -> None:
     """Discover a robot, move its joints, and identify topology, kinematic chain and inertia.
 
+    With --viewer serve its page is served on after the end, until Ctrl-C.
     Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 5 sensors are sick, and
     the result is without their modules, or there is none; 130 interrupted.
     """
@@ -79,12 +85,12 @@ def run(
         max_bytes=round(1e9 * max_disk),
     )
     advice = f"to resume: {resuming(context)}" if advise else ""
-    with Terminal(at.quiet) as terminal:
-        result, _ = run_attended(config, place, speed, terminal, advice)
-    print_result(result, terminal)
-    terminal.console.print(f"written to {out}{report_at(out)}", markup=False, soft_wrap=True)
-    if viewer == "serve":
-        terminal.note(f"the page has ended; to see the run again: x5-coordinator view {out} --serve")
+    with live_page(viewer, serve_port) as stay:
+        with Terminal(at.quiet) as terminal:
+            result, _ = run_attended(config, place, speed, terminal, advice)
+        print_result(result, terminal)
+        terminal.console.print(f"written to {out}{report_at(out)}", markup=False, soft_wrap=True)
+        stay()
     end_if_suspect(result.suspicions)
 
 

@@ -1,20 +1,22 @@
-"""`x5-coordinator view`: a finished run in the viewer, on this screen or in a browser."""
+"""`x5-coordinator view`: a finished run on this screen or in a browser; and the page of a live run."""
 
 import os
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from coordinator.recording.run_folder import VIEW
-from coordinator.runtime.command_line import CommandFailed
 from coordinator.runtime.event_loop import SIGNALS
 from coordinator.viewer import viewer_process
-from coordinator.viewer.targets import SERVE_PORT, page_url
-from module_agent.model.errors import EXIT_FAILED, UsageError
+from coordinator.viewer.page import Page
+from coordinator.viewer.targets import SERVE_PORT
+from module_agent.model.errors import UsageError
 
 _POLL_S = 0.2
 # Without one of these there is no window on Linux.
@@ -47,17 +49,42 @@ def view(
     if not serve:
         viewer_process.start([str(recording)], viewer_process.free_port(), detached=True)
         return
-    for taken in (port, port + 1):
-        if viewer_process.listens("127.0.0.1", taken):
-            raise UsageError(f"--port {port}: something listens on port {taken} already; choose another")
-    served = viewer_process.start([str(recording)], port + 1, detached=False, page_port=port)
-    typer.echo(f"open {page_url(port)} in a browser; Ctrl-C ends it")
+    with Page(port, [str(recording)]) as page:
+        typer.echo(f"open {page.url} in a browser; Ctrl-C ends it")
+        _serve_until_signal(page)
+
+
+@contextmanager
+def live_page(viewer: str, port: int) -> Iterator[Callable[[], None]]:
+    """Serve a page to what is shown within the block, if the viewer is `serve`, and say where it is.
+
+    Quiet programs say it as well: without the address there is nothing to see. Yields what goes on serving
+    the page until a signal, to be called when all else is done; without a page it does nothing.
+
+    Raises:
+        UsageError, ViewerNotStarted: as `Page`.
+    """
+    if viewer != "serve":
+        yield lambda: None
+        return
+    with Page(port) as page:
+        typer.echo(f"open {page.url} in a browser", err=True)
+
+        def stay() -> None:
+            typer.echo(f"the run has ended; {page.url} shows it until Ctrl-C", err=True)
+            _serve_until_signal(page)
+
+        yield stay
+
+
+def _serve_until_signal(page: Page) -> None:
+    """Go on serving a page until a signal comes, which ends that and nothing else.
+
+    Raises:
+        PageEnded: it is not served any more.
+    """
     ended = threading.Event()
     for number in SIGNALS:
         signal.signal(number, lambda *_: ended.set())
-    try:
-        while not ended.wait(_POLL_S):
-            if served.process.poll() is not None:
-                raise CommandFailed(f"the viewer ended: {served.output_tail()}", EXIT_FAILED)
-    finally:
-        viewer_process.stop(served)
+    while not ended.wait(_POLL_S):
+        page.check()

@@ -1,9 +1,9 @@
-"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page."""
+"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere."""
 
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 from coordinator.viewer import viewer_process
 from coordinator.viewer.scene import entity_paths
@@ -27,24 +27,24 @@ class ViewerTargets(NamedTuple):
 
     rrd: file to write, which is complete whatever happens to the live viewers.
     spawn: start a native viewer (or use the one that listens already) and leave it open at the end.
-    connect: gRPC address of a running viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
-    serve_port: serve a web page on this port of 127.0.0.1 and its data on the next one, until the run ends.
+    connect: gRPC address of a running viewer or page, such as `rerun+http://127.0.0.1:9876/proxy`.
     """
 
     rrd: Path | None = None
     spawn: bool = False
     connect: str | None = None
-    serve_port: int | None = None
 
 
-def viewer_choice(text: str, serve_port: int | None = None) -> ViewerTargets:
-    """Parse `none`, `spawn`, `serve` (on a port) or an address.
+def viewer_choice(text: str, serve_port: int = SERVE_PORT) -> ViewerTargets:
+    """Parse `none`, `spawn`, `serve` or an address; served are the data of the page on a port (`Page`).
 
     Raises:
         UsageError: none of these; the message lists what is allowed.
     """
-    if text in ("none", "spawn", "serve"):
-        return ViewerTargets(spawn=text == "spawn", serve_port=serve_port if text == "serve" else None)
+    if text in ("none", "spawn"):
+        return ViewerTargets(spawn=text == "spawn")
+    if text == "serve":
+        return ViewerTargets(connect=proxy_url(serve_port + 1))
     scheme, separator, rest = text.partition("://")
     if scheme not in SCHEMES or not separator or not rest:
         raise UsageError(
@@ -54,7 +54,7 @@ def viewer_choice(text: str, serve_port: int | None = None) -> ViewerTargets:
 
 
 class Opened(NamedTuple):
-    """The streams that the targets need, and the web server to stop at the end of the run.
+    """The streams that the targets need.
 
     A file gets few large chunks and a live viewer small ones at once, so they have a stream each, of the same
     recording.
@@ -62,7 +62,6 @@ class Opened(NamedTuple):
 
     file: "rr.RecordingStream | None" = None
     live: "rr.RecordingStream | None" = None
-    web_server: viewer_process.ViewerProcess | None = None
 
 
 def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
@@ -82,30 +81,20 @@ def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
         batching = rr.ChunkBatcherConfig(flush_tick=FILE_TICK_SECONDS)
         file = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id, batcher_config=batching)
         file.set_sinks(rr.FileSink(str(targets.rrd)))
-    urls, web_server, port = [targets.connect], None, targets.serve_port
+    urls = [targets.connect]
     if targets.spawn:
-        native = viewer_process.listens("127.0.0.1", NATIVE_PORT) or _started("native", NATIVE_PORT)
+        native = viewer_process.listens("127.0.0.1", NATIVE_PORT) or _started_native()
         urls.insert(0, proxy_url(NATIVE_PORT) if native else None)
-    if port is not None:
-        web_server = _started("web", port + 1, page_port=port)
-    if port is not None and web_server is not None:
-        urls.append(proxy_url(port + 1))
-        logger.info("open %s in a browser", page_url(port))
     reached = [url for url in dict.fromkeys(urls) if url is not None and _reachable(url)]
     if reached:
         live = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id)
         live.set_sinks(*(rr.GrpcSink(url) for url in reached))
-    return Opened(file, live, web_server)
+    return Opened(file, live)
 
 
 def proxy_url(port: int) -> str:
     """Return the address of a viewer on this machine."""
     return f"rerun+http://127.0.0.1:{port}/proxy"
-
-
-def page_url(port: int) -> str:
-    """Return the address of a page served on a port; without that of its data the page is empty."""
-    return f"http://127.0.0.1:{port}?url={quote(proxy_url(port + 1), safe='')}"
 
 
 def _reachable(url: str) -> bool:
@@ -120,10 +109,11 @@ def _reachable(url: str) -> bool:
     return False
 
 
-def _started(which: str, port: int, page_port: int | None = None) -> viewer_process.ViewerProcess | None:
-    """Start a viewer; only the native one outlives this process."""
+def _started_native() -> bool:
+    """Start a viewer with a window, which outlives this process; return whether there is one."""
     try:
-        return viewer_process.start([], port, detached=which == "native", page_port=page_port)
+        viewer_process.start([], NATIVE_PORT, detached=True)
     except viewer_process.ViewerNotStarted as failure:
-        logger.warning("the %s viewer did not start, so the run is not shown there: %s", which, failure)
-        return None
+        logger.warning("the native viewer did not start, so the run is not shown there: %s", failure)
+        return False
+    return True

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.viewer import viewer_process
 from coordinator.viewer.logging_thread import LoggingThread
 from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import Estimate
@@ -201,8 +200,6 @@ class Viewer:
         if self.dropped:
             logger.warning("%d batches were dropped: they came faster than the viewer logs", self.dropped)
         complete = complete and _ends_within(DISCONNECT_SECONDS, self._disconnect)
-        if self._opened.web_server is not None:
-            viewer_process.stop(self._opened.web_server)
         # A stream has threads until nothing refers to it and it is cleaned up.
         self._recorders, self._opened = (), Opened()
         if complete:

@@ -9,13 +9,14 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import PlanOptions, Quiet
+from coordinator.commands.options import LiveViewer, PlanOptions, Quiet, ServePort
+from coordinator.commands.view import live_page
 from coordinator.live_robot.authority import make_credentials
 from coordinator.recording.run_folder import REPORT, RESULT
 from coordinator.runtime.command_line import ENDINGS, end_if_suspect, ending, fail, with_options
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
 from coordinator.runtime.terminal import Terminal
-from coordinator.viewer.targets import NATIVE_PORT, proxy_url, viewer_choice
+from coordinator.viewer.targets import NATIVE_PORT, SERVE_PORT, proxy_url, viewer_choice
 from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_SUSPECT, UsageError
 from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import score_run
@@ -24,7 +25,6 @@ from sim.robot.robot_file import RobotFileError
 from sim.scoring.truth_recording import add_truth
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
-Viewer = Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")]
 _note = partial(typer.echo, err=True)
 # Previews of larger robots are only assembled: their refinements would take longer than the run.
 MAX_REFINED_MODULES = 8
@@ -38,15 +38,17 @@ def run(
     virtual: Annotated[
         bool, typer.Option("--virtual", help="In one process, faster than real time.")
     ] = False,
-    viewer: Viewer = "none",
+    viewer: LiveViewer = "none",
+    serve_port: ServePort = SERVE_PORT,
     quiet: Quiet = False,
 ) -> None:
     """Identify a simulated robot and score the result against the truth; Ctrl-C stops everything.
 
-    World, agents and coordinator are processes, or with --virtual one process on a virtual clock.
+    World, agents and coordinator are processes, or with --virtual one process on a virtual clock. With
+    --viewer serve the page is served on after the end, until Ctrl-C.
     """
     if not virtual:
-        _launch(settings, launched, motions, viewer, quiet)
+        _launch(settings, launched, motions, viewer, serve_port, quiet)
         return
     if viewer != "none":
         raise UsageError(
@@ -79,10 +81,11 @@ def launch(
     settings: WorldOptions,
     launched: LaunchOptions,
     motions: PlanOptions,
-    viewer: Viewer = "spawn",
+    viewer: LiveViewer = "spawn",
+    serve_port: ServePort = SERVE_PORT,
 ) -> None:
     """Do as `run --viewer spawn`, whose older name this is."""
-    _launch(settings, launched, motions, viewer, quiet=False)
+    _launch(settings, launched, motions, viewer, serve_port, quiet=False)
 
 
 def _launch(
@@ -90,13 +93,15 @@ def _launch(
     launched: LaunchOptions,
     motions: PlanOptions,
     viewer: str,
+    serve_port: int,
     quiet: bool,
 ) -> None:
     """Run all processes, then score the result, and draw the truth in the recording and in the viewer."""
-    choice = viewer_choice(viewer)
+    choice = viewer_choice(viewer, serve_port)
     # Where the viewer can still be reached when the run is over.
     reachable = proxy_url(NATIVE_PORT) if choice.spawn else choice.connect
-    shown = ("--viewer", viewer, *(("--quiet",) if quiet else ()))
+    # The page is this program's own: it stays when the coordinator has ended, and gets the truth, too.
+    shown = ("--viewer", choice.connect or viewer, *(("--quiet",) if quiet else ()))
     robot = load(settings.robot)
     launched.check()
     # The noise, the plan and the pushes are checked here; coordinator and world read them again.
@@ -127,10 +132,12 @@ def _launch(
     )
     if config.secure is not None:
         make_credentials(config.secure, robot.name, robot.serials, [s for s in config.shares if len(s) > 1])
-    code = _run_processes(config)
-    add_truth(config.out, reachable, _note)
-    score_run(config.out)
-    _print_report(config.out)
+    with live_page(viewer, serve_port) as stay:
+        code = _run_processes(config)
+        add_truth(config.out, reachable, _note)
+        score_run(config.out)
+        _print_report(config.out)
+        stay()
     if code:
         # The coordinator has said why.
         raise typer.Exit(code)

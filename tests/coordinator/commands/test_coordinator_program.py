@@ -174,7 +174,7 @@ def test_every_end_of_a_run_has_a_sentence_and_a_code_and_a_defect_has_none() ->
 def test_a_viewer_is_a_word_or_an_address() -> None:
     assert viewer_choice("none") == ViewerTargets()
     assert viewer_choice("spawn").spawn
-    assert viewer_choice("serve", 9090) == ViewerTargets(serve_port=9090)
+    assert viewer_choice("serve", 9090) == ViewerTargets(connect="rerun+http://127.0.0.1:9091/proxy")
     assert viewer_choice("rerun+http://host:9876/proxy").connect == "rerun+http://host:9876/proxy"
     for nonsense in ("", "rerun+http://", "ftp://host", "spawned"):
         with pytest.raises(UsageError, match="it must be none, spawn, serve"):

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from coordinator.viewer import viewer_process
+from coordinator.viewer.page import Page, PageEnded
 from coordinator.viewer.targets import ViewerTargets, proxy_url
 from coordinator.viewer.viewer import Viewer
 from module_agent.wire.feedback_rows import Rows
@@ -62,17 +63,25 @@ def test_a_viewer_that_dies_in_the_middle_leaves_the_file_complete(
 
 
 @pytest.mark.integration
-def test_the_web_page_is_served_to_this_machine_only_and_ends_with_the_run() -> None:
-    port = viewer_process.free_port()
-    viewer = Viewer("arm", "r", ViewerTargets(serve_port=port))
-    try:
+def test_a_page_and_its_data_are_served_to_this_machine_only_until_it_is_left(page_port: int) -> None:
+    port = page_port
+    with Page(port):
         listening = subprocess.run(["ss", "-ltnH"], capture_output=True, text=True, check=True).stdout
         ours = [line.split()[3] for line in listening.splitlines() if line.split()[3].endswith(f":{port}")]
         assert ours == [f"127.0.0.1:{port}"]
         assert viewer_process.listens("127.0.0.1", port + 1)
-    finally:
-        viewer.close()
     assert not viewer_process.listens("127.0.0.1", port)
+    assert not viewer_process.listens("127.0.0.1", port + 1)
+
+
+@pytest.mark.integration
+def test_a_page_whose_server_died_is_reported_with_its_output(page_port: int) -> None:
+    with Page(page_port) as page:
+        page.check()
+        page._served.process.kill()
+        page._served.process.wait()
+        with pytest.raises(PageEnded, match="the viewer's page ended"):
+            page.check()
 
 
 @pytest.mark.integration
