@@ -32,6 +32,10 @@ class Listener(Protocol):
         """Take a sentence of the attendant."""
         ...
 
+    def warn(self, text: str, t_ns: int) -> None:
+        """Take a warning that the robot is about to move: it must reach people who asked for quiet, too."""
+        ...
+
     def report(self, update: MonitorUpdate) -> None:
         """Take what the monitor reports."""
         ...
@@ -133,9 +137,11 @@ class AttendSession:
         return wanted
 
     def _take(self, step: Step) -> Measurement | None:
+        self.changed |= bool(step.say or step.warn)
         for line in step.say:
-            self.changed = True
             self._say(line)
+        for line in step.warn:
+            self._listener.warn(line, self._site.clock())
         return step.measure
 
     def _say(self, text: str) -> None:

@@ -66,10 +66,11 @@ class Measurement(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What to say, and what to measure, if anything."""
+    """What to say, and what to measure, if anything; `warn` is said last, also where all else is quiet."""
 
     say: tuple[str, ...] = ()
     measure: Measurement | None = None
+    warn: tuple[str, ...] = ()
 
 
 class Outcome(NamedTuple):
@@ -145,9 +146,15 @@ class Attendant:
                 )
         if not causes or not self._may_move or self._failures >= self._patience.attempts:
             return Step(tuple(say))
-        words, ready = self._ready(seen)
-        say += words
-        if not ready:
+        if obstacle := self._obstacle(seen):
+            news = [f"waits {obstacle}"] if obstacle != self._waits_for else []
+            self._waits_for, self._clear_ns = obstacle, None
+            return Step((*say, *news))
+        self._waits_for = ""
+        if self._clear_ns is None:
+            self._clear_ns = seen.t_ns
+            return Step(tuple(say), warn=(self._notice(),))
+        if not self._lasts(seen.t_ns, self._clear_ns, self._patience.notice_s):
             return Step(tuple(say))
         return Step(tuple(say), Measurement(_aim(causes), texts, tuple(sorted(seen.present))))
 
@@ -256,21 +263,11 @@ class Attendant:
 
     # ------------------------------------------------------------------ when to measure
 
-    def _ready(self, seen: Observation) -> tuple[list[str], bool]:
-        """Return what to say of what is waited for, and whether the robot may move now."""
-        waits_for = self._obstacle(seen)
-        if waits_for:
-            news = [f"waits {waits_for}"] if waits_for != self._waits_for else []
-            self._waits_for, self._clear_ns = waits_for, None
-            return news, False
-        self._waits_for = ""
-        if self._clear_ns is None:
-            self._clear_ns = seen.t_ns
-            return [
-                f"THE ROBOT MOVES in {self._patience.notice_s:.0f} s, slowly at first, to be measured again: "
-                "keep clear of it, or end this program"
-            ], False
-        return [], self._lasts(seen.t_ns, self._clear_ns, self._patience.notice_s)
+    def _notice(self) -> str:
+        return (
+            f"THE ROBOT MOVES in {self._patience.notice_s:.0f} s, slowly at first, to be measured again: "
+            "keep clear of it, or end this program"
+        )
 
     def _obstacle(self, seen: Observation) -> str:
         if not seen.present:

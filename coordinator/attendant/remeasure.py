@@ -21,7 +21,7 @@ from coordinator.identification.result import Result
 from coordinator.recording.versions import Versions
 from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
-from module_agent.model.errors import RobotError
+from module_agent.model.errors import RobotError, named_files
 
 # Of the motions for the inertia; with them a run lasts as long as a monitor needs to know what is normal.
 INERTIA = {"excitation": "d-optimal", "excitation_motions": 4, "excitation_s": 4.0}
@@ -56,20 +56,38 @@ class Remeasurement:
     async def measure(self, wanted: Measurement, known: BaselineRobot) -> Measured:
         """Run a session that shows what has changed; make it the current version if something has.
 
-        A measurement that fails is noted in the history, and leaves the version that holds.
+        A measurement that fails, or cannot be written, is noted in the history, and leaves the version that
+        holds.
         """
-        versions = self._versions
-        out = versions.next_run()
-        number = int(out.name)
+        out = self._versions.next_run()
         try:
-            aim = "links" if _nested(known.folder) >= MAX_NESTED else wanted.aim
-            result, later = await self._run(aim, wanted, known, out)
-            found = await self._site.compute(lambda: changes(aim, known, later))
-            if result.suspicions:
-                raise SuspectMeasurement("; ".join(result.suspicions))
+            with named_files():
+                return await self._measured(wanted, known, out)
         except RobotError as error:
-            versions.note("failed", number, self._site.utc(), wanted.why, [str(error)])
-            return Measured(Outcome("failed", (str(error),)), known)
+            return Measured(Outcome("failed", (str(error), *self._failed(wanted, out, error))), known)
+
+    def _failed(self, wanted: Measurement, out: Path, error: RobotError) -> tuple[str, ...]:
+        """Note a measurement that failed; return what there is to say of it, where it cannot be noted."""
+        try:
+            with named_files():
+                self._versions.note("failed", int(out.name), self._site.utc(), wanted.why, [str(error)])
+        except RobotError as unwritten:
+            return (f"not noted in the history: {unwritten}",)
+        return ()
+
+    async def _measured(self, wanted: Measurement, known: BaselineRobot, out: Path) -> Measured:
+        """Measure into a folder; see `measure`.
+
+        Raises:
+            RobotError: it failed.
+            OSError: a file cannot be written.
+        """
+        versions, number = self._versions, int(out.name)
+        aim = "links" if _nested(known.folder) >= MAX_NESTED else wanted.aim
+        result, later = await self._run(aim, wanted, known, out)
+        found = await self._site.compute(lambda: changes(aim, known, later))
+        if result.suspicions:
+            raise SuspectMeasurement("; ".join(result.suspicions))
         if not found.changed:
             versions.note("confirmed", number, self._site.utc(), wanted.why, found.words)
             words = (f"measured again: version {versions.current_number} holds", *found.words)
@@ -98,7 +116,12 @@ class Remeasurement:
         site = self._site
 
         def prepared() -> Run:
-            return Run(config, site.connect(), site.clock, site.post, self._screen)
+            transport = site.connect()
+            try:
+                return Run(config, transport, site.clock, site.post, self._screen)
+            except BaseException:
+                transport.close()
+                raise
 
         run = await site.compute(prepared)
         return await run.run(), run.robot

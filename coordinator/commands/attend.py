@@ -73,6 +73,7 @@ def attend(
     if room is not None:
         # Refused now, and not when something has changed.
         room.plan(settings, known.serials)
+        versions.check_writable()
     loop = ScaledLoop(speed)
     place, screen = at.place(known.robot), AttendScreen(json_file, at.quiet)
     # The hub of the agents, if there is no other, stays as long as this program.

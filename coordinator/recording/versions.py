@@ -8,6 +8,7 @@ numbered from 2; `versions/current` is a symbolic link to the one that holds, re
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -41,7 +42,7 @@ class HistoryEntry(BaseModel):
 
 
 class VersionError(UsageError):
-    """There is no such version, or its folder is damaged; the message names it."""
+    """There is no such version, or its folder is damaged or not writable; the message names it."""
 
 
 def current_run(folder: Path) -> Path:
@@ -68,6 +69,21 @@ class Versions:
 
     def __init__(self, folder: Path):
         self.folder = folder
+
+    def check_writable(self) -> None:
+        """Check that new versions can be written; nothing is left behind.
+
+        Raises:
+            VersionError: they cannot.
+        """
+        folder = self.folder / VERSIONS
+        try:
+            with TemporaryFile(dir=folder if folder.exists() else self.folder):
+                pass
+        except OSError as error:
+            raise VersionError(
+                f"{folder}, where new models are kept, cannot be written: {error.strerror or error}"
+            ) from error
 
     @property
     def current(self) -> Path:
@@ -116,14 +132,16 @@ class Versions:
         return self.folder / VERSIONS / f"{max([FIRST, *taken]) + 1:04d}"
 
     def replace(self, number: int, utc: str, why: Sequence[str], found: Sequence[str]) -> None:
-        """Make a version the current one, and note it.
+        """Note a version, and make it the current one.
 
         Raises:
             VersionError: see `run_of`.
             OSError: the link or the history cannot be written.
         """
-        self._point(number)
+        self.run_of(number)
+        # First, so that a version that cannot be noted does not hold either.
         self.note("replaced", number, utc, why, found)
+        self._point(number)
 
     def choose(self, number: int, utc: str) -> None:
         """Make an earlier version the current one again; errors as of `replace`."""

@@ -15,7 +15,14 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from module_agent.model.errors import EXIT_CODES, EXIT_INTERRUPTED, EXIT_SUSPECT, RobotError, UsageError
+from module_agent.model.errors import (
+    EXIT_CODES,
+    EXIT_INTERRUPTED,
+    EXIT_SUSPECT,
+    RobotError,
+    UsageError,
+    named_files,
+)
 from module_agent.model.settings import LOG_LEVELS, SETTINGS, read_settings, variable
 from module_agent.model.suggestion import did_you_mean
 from module_agent.model.version import installed_version
@@ -118,14 +125,10 @@ def lazy_app(
 
         def invoke(self, ctx: Any) -> Any:
             try:
-                return super().invoke(ctx)
+                with named_files():
+                    return super().invoke(ctx)
             except ENDINGS as error:
                 end = ending(error)
-                logger.debug("where it ended:", exc_info=error)
-            except OSError as error:
-                if error.filename is None:
-                    raise
-                end = RobotError(f"cannot use {error.filename}: {error.strerror}")
                 logger.debug("where it ended:", exc_info=error)
             typer.echo(f"{program}: {end}", err=True)
             raise typer.Exit(end.exit_code)

@@ -4,6 +4,9 @@ A RobotError is raised for what may go wrong with a correct program. Everything 
 is a programming error and ends it with a traceback; a RobotError is therefore never a ValueError.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_SUSPECT, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 # What the codes of all programs mean; 128 + n is the end by signal n.
 EXIT_CODES = {
@@ -37,3 +40,22 @@ class LostError(RobotError):
 
 class DataError(RobotError):
     """The measurements do not answer what is asked: they are too few, too weak, contradictory or damaged."""
+
+
+class FileError(RobotError):
+    """A file or folder cannot be read or written; the message names it, and has the system's reason."""
+
+
+@contextmanager
+def named_files() -> Iterator[None]:
+    """Raise errors of the system about a named file as `FileError`, for the block.
+
+    Raises:
+        FileError: a file or folder in the block cannot be used.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise FileError(f"cannot use {error.filename}: {error.strerror}") from error

@@ -51,6 +51,9 @@ class Ears:
     def say(self, text: str, t_ns: int) -> None:
         self.said.append((1e-9 * t_ns, text))
 
+    def warn(self, text: str, t_ns: int) -> None:
+        self.say(text, t_ns)
+
     def report(self, update: MonitorUpdate) -> None:
         self.noted += update.notes
 

@@ -60,6 +60,26 @@ def test_a_workspace_without_room_keeps_the_model(known_arm: Path, tmp_path: Pat
     assert scene.versions.current == scene.versions.folder
 
 
+def test_a_folder_in_which_nothing_can_be_written_ends_a_measurement_and_not_the_attendant(
+    known_arm: Path, tmp_path: Path
+) -> None:
+    scene = Scene(known_arm, tmp_path / "arm", ROOM)
+
+    def becomes_useless() -> None:
+        # A file in the place of the folder: what is refused to root as well.
+        (scene.versions.folder / "versions").write_text("")
+        scene.robot.kill(LAST)
+
+    scene.at(2.0, becomes_useless)
+    scene.plays(45.0)
+    (failed,) = [text for _, text in scene.ears.said if "could not be measured, again in 60 s" in text]
+    assert f"cannot use {scene.versions.folder / 'versions'}" in failed
+    assert "not noted in the history" in failed
+    assert scene.versions.current == scene.versions.folder
+    # The watch went on: it could only join the network once the measurement had left it.
+    assert scene.loop.now_ns >= 45e9
+
+
 def test_a_module_that_comes_back_while_the_rest_is_measured_ends_that_by_name(
     known_arm: Path, tmp_path: Path
 ) -> None:

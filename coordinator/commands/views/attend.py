@@ -1,4 +1,7 @@
-"""What an attendant says, with the time of day, on standard output; and as JSON lines."""
+"""What an attendant says, with the time of day, on standard output; and as JSON lines.
+
+Where that is quiet, or taken by the lines of JSON, what warns of motion is on standard error.
+"""
 
 from datetime import datetime
 from pathlib import Path
@@ -6,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from coordinator.monitoring.monitor import MonitorUpdate
-from coordinator.runtime.terminal import Displayed, JsonLines
+from coordinator.runtime.terminal import Displayed, JsonLines, Terminal
 
 
 class AttendScreen(Displayed):
@@ -22,7 +25,12 @@ class AttendScreen(Displayed):
 
     def say(self, text: str, t_ns: int) -> None:
         """Show a sentence of the attendant."""
-        self._print(text, t_ns)
+        self._print(self.console, text, t_ns)
+        self._lines.write({"t_ns": t_ns, "says": text})
+
+    def warn(self, text: str, t_ns: int) -> None:
+        """Show a warning that the robot is about to move, whatever is quiet."""
+        self._print(Terminal().console if self.console.quiet else self.console, text, t_ns)
         self._lines.write({"t_ns": t_ns, "says": text})
 
     def step(self, index: int, total: int, text: str, left_s: float | None = None) -> None:
@@ -35,11 +43,12 @@ class AttendScreen(Displayed):
             self._lines.write({"note": note})
         for finding in update.findings:
             over = "" if finding.until_ns is None or finding.kind == "collision" else ", over now"
-            self._print(f"{finding.kind}: {finding.summary}{over}", finding.reported_ns)
+            self._print(self.console, f"{finding.kind}: {finding.summary}{over}", finding.reported_ns)
             self._lines.write({"finding": finding.model_dump()})
         for key in update.withdrawn:
             self._lines.write({"withdrawn": list(key)})
 
-    def _print(self, text: str, t_ns: int) -> None:
+    @staticmethod
+    def _print(console: Console, text: str, t_ns: int) -> None:
         at = datetime.fromtimestamp(1e-9 * t_ns).astimezone()
-        self.console.print(f"{at:%Y-%m-%d %H:%M:%S}  {text}", markup=False, soft_wrap=True)
+        console.print(f"{at:%Y-%m-%d %H:%M:%S}  {text}", markup=False, soft_wrap=True)

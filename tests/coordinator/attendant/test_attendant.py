@@ -26,6 +26,7 @@ class Story:
         self.attendant = Attendant(known, may_move)
         self.now_s = 0.0
         self.said: list[tuple[float, str]] = []
+        self.warned: list[tuple[float, str]] = []
         self.present: Mapping[str, int] = ARM
         self.findings: Sequence[Finding] = ()
         self.holders: Mapping[str, str] = {}
@@ -37,7 +38,8 @@ class Story:
             self.now_s += LOOK_S
             seen = Observation(round(self.now_s * 1e9), self.present, self.findings, self.holders)
             step = self.attendant.look(seen)
-            self.said += [(self.now_s, line) for line in step.say]
+            self.warned += [(self.now_s, line) for line in step.warn]
+            self.said += [(self.now_s, line) for line in (*step.say, *step.warn)]
             if step.measure is not None:
                 return step.measure
         return None
@@ -76,6 +78,8 @@ def test_a_module_that_is_gone_is_said_and_measured_once_the_robot_is_left_alone
     # Not before it is still, and not before the notice has passed.
     assert story.now_s >= 20.0 + WAIT.still_s + WAIT.notice_s
     (announced,) = story.heard("THE ROBOT MOVES")
+    # As a warning, which is said where all else is quiet.
+    assert [at_s for at_s, _ in story.warned] == [announced]
     assert story.now_s - announced >= WAIT.notice_s
 
 

@@ -42,6 +42,17 @@ def test_a_new_version_takes_the_place_of_the_current_one_and_the_old_ones_stay(
     assert not list((robot / VERSIONS).glob("*.part"))
 
 
+def test_a_folder_that_cannot_hold_versions_is_refused_and_one_that_can_is_left_as_it_was(
+    robot: Path,
+) -> None:
+    before = sorted(robot.iterdir())
+    Versions(robot).check_writable()
+    assert sorted(robot.iterdir()) == before
+    (robot / VERSIONS).write_text("a file, which nothing can be written in, not even by root")
+    with pytest.raises(VersionError, match=r"where new models are kept, cannot be written: Not a directory"):
+        Versions(robot).check_writable()
+
+
 def test_a_person_goes_back_to_an_earlier_version(robot: Path) -> None:
     versions = Versions(robot)
     run_in(versions.next_run())
