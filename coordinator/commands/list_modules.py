@@ -8,7 +8,6 @@ from coordinator.commands.options import ConnectOptions, Expect, JsonFile
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import AS_HUB_S, Listing, Search, listed, stop_robot
 from coordinator.monitoring.module_states import full_name
-from coordinator.recording.recording import Recording
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal, figure, new_table, print_table, write_result
 from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
@@ -27,7 +26,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
     transport, search = _open_search(place, at.quiet, expect)
     found = listed(transport, place.robot, search)
     delays = {one.serial: one for one in feedback_delays(found.recording)}
-    rows = [_fields(status, found.recording, delays.get(status.serial)) for status in found.statuses]
+    rows = [_fields(status, found, delays.get(status.serial)) for status in found.statuses]
     if write_result(json_file, rows):
         print_table(_table(place.robot, found, delays))
         if found.cpu_us_per_message is not None:
@@ -37,11 +36,20 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
     _check(place.robot, len(found.statuses), expect, "status", found.silent)
 
 
-def _fields(status: Status, recording: Recording, delay: FeedbackDelay | None) -> dict[str, object]:
-    """Return what is known of a module, for programs; family, name and type as it tells them, or None."""
-    info = recording.modules[status.serial].info
+def _fields(status: Status, found: Listing, delay: FeedbackDelay | None) -> dict[str, object]:
+    """Return what is known of a module, for programs; family, name and type as it tells them, or None.
+
+    What a received message costs this program is of all modules together, and the same in each.
+    """
+    info = found.recording.modules[status.serial].info
     told = {name: getattr(info, name, None) for name in ("module_type", "family", "name")}
-    return {**status.model_dump(), **told, "feedback_delay": delay and delay._asdict()}
+    cost_us = found.cpu_us_per_message
+    return {
+        **status.model_dump(),
+        **told,
+        "feedback_delay": delay and delay._asdict(),
+        "cpu_us_per_message": cost_us,
+    }
 
 
 def _table(robot: str, found: Listing, delays: Mapping[str, FeedbackDelay]) -> Table:

@@ -303,11 +303,21 @@ class DelayPart(Part):
     clock_sigma_ms: float
 
 
+class LossPart(Part):
+    """How many rows of a module's feedback came; see `recording.FeedbackLoss`."""
+
+    serial: str
+    received: int
+    lost: int
+    missing: int
+
+
 class Result(Part):
     """All results of one session.
 
-    feedback_delays: by serial. cpu_us_per_message: processor time of the coordinator's event loop for a
-    message received, its recording and display included; None in virtual time and in older recordings.
+    feedback_delays, feedback_losses: by serial. cpu_us_per_message: processor time of the coordinator's event
+    loop for a message received, its recording and display included; None in virtual time and in older
+    recordings.
 
     chain_covariance and null_basis, (6 n, 6 n) and (6 n, k), are over the perturbations of
     `model.perturbation`: per module of the chain a twist of its pose at q = 0 in the root frame.
@@ -339,6 +349,7 @@ class Result(Part):
     suspicions: list[str] = Field(default_factory=list)
     imu_places: list[ImuPlacePart] = Field(default_factory=list)
     feedback_delays: list[DelayPart] = Field(default_factory=list)
+    feedback_losses: list[LossPart] = Field(default_factory=list)
     robot_time_s: float
     wall_time_s: float | None
     cpu_us_per_message: float | None = None

@@ -19,6 +19,7 @@ from coordinator.identification.result import (
     HeldOutPart,
     IdentifiabilityPart,
     LinkPart,
+    LossPart,
     ModuleBodyPart,
     MountingPart,
     PairPart,
@@ -90,6 +91,9 @@ def build_result(
         excluded=list(kinematics.excluded),
         suspicions=kinematics.suspicions,
         feedback_delays=[DelayPart(**one._asdict()) for one in feedback_delays(recording)],
+        feedback_losses=[
+            LossPart(**module.loss._asdict()) for _, module in sorted(recording.modules.items())
+        ],
         robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
         wall_time_s=finished[-1].wall_time_s if finished else None,
         cpu_us_per_message=finished[-1].cpu_us_per_message if finished else None,

@@ -85,13 +85,27 @@ class Arrivals:
         del self._times_ns[: max(0, len(self._times_ns) - 2 * kept)]
 
 
+class FeedbackLoss(NamedTuple):
+    """How many rows of a module's feedback came, from the first to the newest.
+
+    received: recorded, however they came. lost: had not come by themselves before they came on request, or
+    did not come at all. missing: of the lost ones those that did not come on request either.
+    """
+
+    serial: str
+    received: int
+    lost: int
+    missing: int
+
+
 class ModuleRecord:
     """What is known of one boot of one module; times in nanoseconds.
 
     newest_ns: latest module time in any message. feedback_ns: session time at which feedback was published
     last, None before the first. newest_row_ns, newest_row_arrival_ns: module time of the newest published
     row, and session time at which it first arrived; messages that come late or twice do not change them.
-    arrivals: of all published messages whose rows had not come before.
+    arrivals: of all published messages whose rows had not come before. requested_rows: how many came in
+    answer to a request, and not by themselves before.
     """
 
     def __init__(self, serial: str, boot: int):
@@ -108,6 +122,14 @@ class ModuleRecord:
         self.newest_row_ns = -1
         self.newest_row_arrival_ns = 0
         self.arrivals = Arrivals()
+        self.requested_rows = 0
+
+    @property
+    def loss(self) -> FeedbackLoss:
+        """The loss of feedback, unless rows were forgotten."""
+        log = self.rows
+        missing = log.end_row - log.first_row - log.count
+        return FeedbackLoss(self.serial, log.count, missing + self.requested_rows, missing)
 
     @property
     def trips(self) -> list[RoundTrip]:
@@ -273,7 +295,10 @@ class Recording:
         match message:
             case Feedback():
                 is_new = not module.rows.has(message.first_row + message.count - 1)
+                before = module.rows.count
                 rows = module.rows.add(message)
+                if entry.kind == "reply":
+                    module.requested_rows += module.rows.count - before
                 if len(rows):
                     row_ns = int(rows["t_ns"][-1])
                     module.newest_ns = max(module.newest_ns, row_ns)

@@ -288,16 +288,16 @@ def _network(recording: Recording) -> Section:
     delays = {one.serial: one for one in feedback_delays(recording)}
     for serial, ms in trips_ms.items():
         delay = delays.get(serial)
-        log, clock = recording.modules[serial].rows, clocks.get(serial)
-        lost = sum(end - first for first, end in log.missing(log.first_row, log.end_row))
+        loss, clock = recording.modules[serial].loss, clocks.get(serial)
         rows.append(
             (
                 serial,
                 len(ms),
                 float(np.median(ms)),
                 float(np.percentile(ms, 95)),
-                log.end_row - log.first_row,
-                lost,
+                loss.received + loss.missing,
+                loss.lost,
+                loss.missing,
                 _delay_cell(delay, delay.p50_ms) if delay is not None else None,
                 _delay_cell(delay, delay.p99_ms) if delay is not None else None,
                 _NS * clock.offset_ns if clock is not None else None,
@@ -311,6 +311,7 @@ def _network(recording: Recording) -> Section:
         Column(name="median", unit="ms", form=".2f", group="round trips"),
         Column(name="95th percentile", unit="ms", form=".2f", group="round trips"),
         Column(name="published", form=".0f", group="feedback rows"),
+        Column(name="lost at first", form=".0f", group="feedback rows"),
         Column(name="missing", form=".0f", group="feedback rows"),
         Column(name="median", unit="ms", form=".2f", group="feedback, sample to coordinator", right=True),
         Column(
@@ -329,8 +330,8 @@ def _network(recording: Recording) -> Section:
         ),
     ]
     missing = (
-        "Rows that were lost at first were asked for again; missing are those that never came. The delay of "
-        "feedback is the age of a message's newest row when it arrived."
+        "Rows that were lost at first, or not heard, were asked for; missing are those that never came. The "
+        "delay of feedback is the age of a message's newest row when it arrived."
     )
     costs = [event.cpu_us_per_message for event in recording.journal if event.cpu_us_per_message]
     cost = f" Receiving and recording a message took {costs[-1]:.0f} µs of processor time." if costs else ""

@@ -1,6 +1,8 @@
 """One message in twenty is lost, and the recording is complete all the same."""
 
-from coordinator.recording.run_folder import load_recording
+import json
+
+from coordinator.recording.run_folder import RESULT, load_recording
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Feedback
@@ -30,12 +32,16 @@ def test_no_row_is_missing_when_the_network_drops_feedback(launcher, programs) -
             feedback = decode(Feedback, entry.payload, MAX_MESSAGE_BYTES)
             live.setdefault(feedback.serial, RowLog(feedback.boot)).add(feedback)
     assert questions > 0
+    told = {each["serial"]: each for each in json.loads((config.out / RESULT).read_text())["feedback_losses"]}
     for serial in config.serials:
         log = recording.modules[serial].rows
         lost = live[serial].missing(live[serial].first_row, live[serial].end_row)
         # 13 s at 50 messages a second: some 30 are lost.
         assert len(lost) >= 5
         assert log.missing(log.first_row, log.end_row) == []
+        lost_rows = log.count - live[serial].count
+        assert lost_rows >= sum(end - first for first, end in lost)
+        assert told[serial] == {"serial": serial, "received": log.count, "lost": lost_rows, "missing": 0}
     found = score(config.out)
     assert found.topology_correct
     assert abs(found.links[0].link_length_error_mm) <= 0.05 * found.links[0].link_length_true_mm

@@ -59,6 +59,7 @@ def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
     assert all(m["holder"].startswith(f"coordinator-{coordinator.process.pid}@") for m in modules)
     assert {m["state"] for m in modules} <= {"armed", "moving"}
     assert all(m["feedback_delay"]["messages"] > 10 for m in modules)
+    assert all(m["cpu_us_per_message"] > 0.0 for m in modules)
 
     stopped = programs.run("coordinator.main", "stop", *where)
     assert stopped.returncode == 0, stopped.stderr

@@ -151,6 +151,23 @@ def test_only_published_rows_set_the_time_of_the_last_feedback(
     )
 
 
+def test_rows_that_came_on_request_alone_were_lost_and_those_that_never_came_are_missing(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
+    rows = wire.feedback().count
+    for message in (0, 1, 3, 5):
+        recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=message * rows)))
+    module = recording.modules["A"]
+    assert module.loss == ("A", 4 * rows, 2 * rows, 2 * rows)
+    # One of the two that were lost comes on request; what had come already is no loss when it comes again.
+    for message in (2, 3):
+        recording.add(wire.reply(Leaf.HISTORY, wire.feedback(first=message * rows)))
+    assert module.loss == ("A", 5 * rows, 2 * rows, rows)
+    # The other one was only late.
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=4 * rows)))
+    assert module.loss == ("A", 6 * rows, rows, 0)
+
+
 def test_late_and_repeated_feedback_does_not_change_when_the_newest_row_arrived(
     recording: Recording, wire: SimpleNamespace
 ) -> None:
