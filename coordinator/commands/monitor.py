@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +20,7 @@ from coordinator.monitoring.live_states import LiveStates
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
-from coordinator.recording.recording import Recording
+from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import read_session
 from coordinator.runtime.command_line import with_options
@@ -29,6 +29,7 @@ from coordinator.runtime.key_presses import key_presses
 from coordinator.runtime.terminal import Terminal
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import EXIT_FINDING, DataError, RobotError, UsageError
+from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 
 # Modules that have sent nothing by then are taken to be absent.
@@ -56,11 +57,11 @@ def monitor_robot(
     json_file: JsonFile = None,
     speed: Speed = 1.0,
 ) -> None:
-    """Monitor a robot: all its modules in a live table, or, if it is known, what happens while it moves.
+    """Monitor a robot: all its modules in a live table, and, if it is known, what happens while it moves.
 
-    Of a known robot collisions, payloads, friction and wear are reported. Nothing is commanded and no lease
-    is taken, but by the keys of the table: s stops all modules, h holds them where they are, l lights the
-    next one's LED, q ends.
+    Of a known robot collisions, payloads, friction and wear are reported, on a terminal below the table.
+    Nothing is commanded and no lease is taken, but by the keys of the table: s stops all modules, h holds
+    them where they are, l lights the next one's LED, q ends.
     Exit codes: 0 no findings, 4 findings, others as of `run`.
     """
     if baseline is None:
@@ -70,7 +71,7 @@ def monitor_robot(
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     reference = build_reference(load_baseline(baseline))
     monitor = Monitor(reference, alarms_per_hour)
-    screen = MonitorScreen(monitor, json_file, at.quiet)
+    screen = MonitorScreen(monitor, json_file, at.quiet, _keys())
     with screen:
         screen.report(MonitorUpdate((), (), reference.remarks))
         if recording is not None:
@@ -83,6 +84,16 @@ def monitor_robot(
 
 
 KEYS = "s stop all    h hold, or release    l light the next LED    q end"
+
+
+def _keys() -> str:
+    """Return the keys that can be pressed."""
+    return KEYS if sys.stdin.isatty() else ""
+
+
+def _actions(modules: LiveStates, end: Callable[[], None]) -> dict[str, Callable[[], None]]:
+    """Return what the keys do."""
+    return {"s": modules.stop, "h": modules.hold, "l": modules.light, "q": end}
 
 
 def _show_modules(
@@ -101,7 +112,7 @@ def _show_modules(
     place = at.place()
     loop, states = ScaledLoop(speed), ModuleStates()
     begin_ns = loop.clock_ns()
-    screen = ModuleScreen(place.robot, json_file, at.quiet, KEYS if sys.stdin.isatty() else "")
+    screen = ModuleScreen(place.robot, json_file, at.quiet, _keys())
     transport = open_connection(place, screen.note).transport
     messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, states.record)
     ended = False
@@ -126,8 +137,7 @@ def _show_modules(
         finally:
             messenger.close()
 
-    keys = key_presses(loop, {"s": live.stop, "h": live.hold, "l": live.light, "q": end})
-    with screen, keys, contextlib.suppress(asyncio.CancelledError):
+    with screen, key_presses(loop, _actions(live, end)), contextlib.suppress(asyncio.CancelledError):
         attend(loop, follow())
     if not states.recording.modules and not ended:
         raise RobotError(f"no module of robot {place.robot!r} answers within {_FIRST_FEEDBACK_S:.0f} s")
@@ -160,29 +170,51 @@ def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
 def _monitor_live(
     monitor: Monitor, screen: MonitorScreen, place: Place, for_s: float | None, speed: float
 ) -> None:
-    """Monitor until the time is up, or a signal comes."""
+    """Monitor until the time is up, a key ends it, or a signal comes.
+
+    Where there is a live table it has all modules, with the keys of the table of any robot.
+    """
     transport = open_connection(place, Terminal().note).transport
     loop = ScaledLoop(speed)
     screen.start_ns = loop.clock_ns()
-    live = LiveMonitor(monitor, loop.clock_ns, new_sender().name, screen.report)
-    messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
+    sender, states, ended = new_sender(), ModuleStates(), False
+    live = LiveMonitor(monitor, loop.clock_ns, sender.name, screen.report)
+
+    def record(entry: Entry) -> Message | None:
+        if screen.is_live:
+            states.record(entry)
+        return live.record(entry)
+
+    messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, record)
+    modules = LiveStates(states, messenger, loop.clock_ns, sender, screen.show_modules, screen.note)
+
+    def end() -> None:
+        nonlocal ended
+        ended = True
 
     def after_ns(seconds: float) -> int:
         return loop.clock_ns() + round(seconds * 1e9)
 
     async def watch() -> None:
         messenger.start()
+        following = asyncio.create_task(modules.follow()) if screen.is_live else None
         try:
-            await live.watch(messenger, after_ns(_FIRST_FEEDBACK_S), lambda: monitor.monitored_s > 0.0)
+            first_ns = after_ns(_FIRST_FEEDBACK_S)
+            await live.watch(messenger, first_ns, lambda: ended or monitor.monitored_s > 0.0)
             if monitor.monitored_s > 0.0:
-                await live.watch(messenger, None if for_s is None else after_ns(for_s))
+                await live.watch(messenger, None if for_s is None else after_ns(for_s), lambda: ended)
         finally:
+            if following is not None:
+                # What is held is released before the network is left.
+                following.cancel()
+                await asyncio.gather(following, return_exceptions=True)
             messenger.close()
 
+    actions = _actions(modules, end) if screen.is_live else {}
     # A signal cancels the task; the summary of the findings follows.
-    with contextlib.suppress(asyncio.CancelledError):
+    with key_presses(loop, actions), contextlib.suppress(asyncio.CancelledError):
         attend(loop, watch())
-    if not monitor.monitored_s:
+    if not monitor.monitored_s and not ended:
         serials = ", ".join(monitor.reference.chain.serials)
         raise RobotError(
             f"not all modules of robot {place.robot!r} sent feedback within {_FIRST_FEEDBACK_S:.0f} s; "

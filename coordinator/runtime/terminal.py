@@ -121,6 +121,11 @@ class Displayed:
         if self._display is not None:
             self._display.stop()
 
+    @property
+    def is_live(self) -> bool:
+        """Whether there is a live display: the console is a terminal, and not quiet."""
+        return self._display is not None
+
     def note(self, text: str) -> None:
         """Show a line of text."""
         self.console.print(f"  {text}", markup=False, soft_wrap=True)

@@ -82,7 +82,7 @@ def attend(tmp_path: Path) -> Iterator[Callable[..., Attendant]]:
             one.process.communicate()
 
 
-def _known(robot: str, out: Path) -> Path:
+def known_by_run(robot: str, out: Path) -> Path:
     """Identify a robot in virtual time, as a launch has it: with IMUs that are not calibrated."""
     plan = Subject(brief=True).plan.model_copy(update={"imu": "uncalibrated"})
     run_virtual(VirtualConfig(load_robot(robot), out, plan=plan), Terminal(True))
@@ -100,7 +100,7 @@ def loses_last(launcher, client, programs, attend, tmp_path: Path):
     robot.start_agent(others)
     victim = robot.start_agent([last], 1)
     options = ("--may-move", "--workspace", str(room))
-    attendant = attend(_known(ARM, tmp_path / "known"), robot.config.endpoint, *options)
+    attendant = attend(known_by_run(ARM, tmp_path / "known"), robot.config.endpoint, *options)
     programs.until(lambda: attendant.said(f"attends {ARM}, version 1"), "the attendant")
     ear = client(ARM)
     ear.meet(robot.config.serials)
@@ -115,7 +115,7 @@ def test_a_module_whose_agent_died_is_said_to_be_gone(launcher, programs, attend
     robot = launcher(ROBOT)
     robot.start_world()
     agents = dict(zip(robot.config.serials, robot.start_agents(), strict=True))
-    attendant = attend(_known(ROBOT, tmp_path / "known"), robot.config.endpoint, "--for", "3600")
+    attendant = attend(known_by_run(ROBOT, tmp_path / "known"), robot.config.endpoint, "--for", "3600")
     programs.until(lambda: attendant.said(f"attends {ROBOT}, version 1"), "the attendant")
     victim = robot.config.serials[-1]
     agents[victim].process.kill()

@@ -1,12 +1,15 @@
-"""Findings of the monitor: a live table on a terminal, lines in a pipe; and a JSON file."""
+"""Findings of the monitor: below live tables on a terminal, lines in a pipe; and a JSON file."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from coordinator.commands.views.module_table import table as module_table
 from coordinator.monitoring.findings import Finding, Key
+from coordinator.monitoring.module_states import ModuleState
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.runtime.terminal import Displayed, JsonLines, new_table
 
@@ -14,11 +17,16 @@ _NOTES = 6
 
 
 class MonitorScreen(Displayed):
-    """Shows what a watcher says. Times are seconds since `start_ns`, which is set before anything is said."""
+    """Shows what a watcher says. Times are seconds since `start_ns`, which is set before anything is said.
 
-    def __init__(self, monitor: Monitor, json_file: Path | None, quiet: bool = False):
+    `keys` says which keys there are, below all modules, if `show_modules` is given any.
+    """
+
+    def __init__(self, monitor: Monitor, json_file: Path | None, quiet: bool = False, keys: str = ""):
         self.start_ns = 0
         self._monitor = monitor
+        self._keys = keys
+        self._states: Sequence[ModuleState] = ()
         self._notes: list[str] = []
         self._lines = JsonLines(json_file)
         console = Console(highlight=False, quiet=quiet or self._lines.to_standard_output)
@@ -28,6 +36,17 @@ class MonitorScreen(Displayed):
     def __exit__(self, *_: object) -> None:
         super().__exit__()
         self._lines.close()
+
+    def show_modules(self, states: Sequence[ModuleState]) -> None:
+        """Show all modules on the network above what is found; on a terminal only."""
+        self._states = states
+
+    def note(self, text: str) -> None:
+        """Show a line of text."""
+        if self._display is None:
+            super().note(text)
+        else:
+            self._notes = [*self._notes, text][-_NOTES:]
 
     def report(self, update: MonitorUpdate) -> None:
         """Show what is new."""
@@ -64,7 +83,7 @@ class MonitorScreen(Displayed):
         if self._display is None:
             self.console.print(text, markup=False, soft_wrap=True)
         else:
-            self._notes = [*self._notes, text][-_NOTES:]
+            self.note(text)
 
     def _write(self, what: dict[str, object]) -> None:
         self._lines.write(what)
@@ -78,7 +97,11 @@ class MonitorScreen(Displayed):
             now = "-" if outside is None else f"{outside[k]:+.2f}"
             table.add_row(serial, now, f"{monitor.thresholds.contact_nm[k]:.2f}")
         findings = [self.sentence(finding) for finding in monitor.finding_log.all]
-        return Group(table, *map(Text, [*findings, *self._notes]))
+        below = map(Text, [*findings, *self._notes])
+        if not self._states:
+            return Group(table, *below)
+        modules = module_table(monitor.reference.name, self._states)
+        return Group(modules, table, *below, Text(self._keys, style="dim"))
 
 
 def _named(key: Key, start_ns: int) -> str:
