@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
+from coordinator.commands.options import JsonFile
 from coordinator.export.exported_run import ExportedRun, check_package, read_exported
 from coordinator.export.messages import write_messages
 from coordinator.export.tables import write_table
 from coordinator.runtime.command_line import in_a_folder
-from coordinator.runtime.terminal import STANDARD_OUTPUT, Terminal
+from coordinator.runtime.terminal import STANDARD_OUTPUT, Terminal, write_result
 from module_agent.model.errors import UsageError
 from module_agent.model.files import replacing
 
@@ -40,6 +41,7 @@ def export(
         float | None,
         typer.Option(help="Interpolate all modules at so many common instants a second [every sample]."),
     ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Write what all modules reported, with units in the names, on one time base.
 
@@ -66,11 +68,14 @@ def export(
             terminal.progress(done, total, f"writing {out.name}")
 
         if to is Format.CSV or to is Format.PARQUET:
-            rows = write_table(out, run, "csv" if to is Format.CSV else "parquet", rate_hz, progress)
-            what = f"{rows} rows"
+            what = "rows"
+            count = write_table(out, run, "csv" if to is Format.CSV else "parquet", rate_hz, progress)
         else:
-            what = f"{_write_mcap(out, run, to, rate_hz, progress)} samples"
-    typer.echo(f"{out}: {what} of {', '.join(run.signals)}")
+            what = "samples"
+            count = _write_mcap(out, run, to, rate_hz, progress)
+    told = {"file": str(out), "format": to.value, what: count, "modules": list(run.signals)}
+    if write_result(json_file, {**told, "missing": list(run.missing)}):
+        typer.echo(f"{out}: {count} {what} of {', '.join(run.signals)}")
 
 
 def _write_mcap(

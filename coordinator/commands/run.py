@@ -10,6 +10,7 @@ from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, 
 from coordinator.commands.options import (
     ConnectOptions,
     Expect,
+    JsonFile,
     LiveViewer,
     PlanOptions,
     ServePort,
@@ -26,7 +27,7 @@ from coordinator.report.plots import MissingPlots
 from coordinator.report.run_report import write_report
 from coordinator.runtime.command_line import ENDINGS, end_if_suspect, ending, fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
-from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.runtime.terminal import Terminal, new_table, write_result
 from coordinator.session.run import Run, RunConfig, write_outputs
 from coordinator.viewer.targets import SERVE_PORT, viewer_choice
 from module_agent.model.errors import UsageError
@@ -60,13 +61,15 @@ def run(
     resume: Annotated[bool, typer.Option(help="Continue the crashed run in --out.")] = False,
     speed: Speed = 1.0,
     report: WithReport = True,
+    json_file: JsonFile = None,
     advise: Annotated[
         bool, typer.Option("--advise/--no-advise", hidden=True, help="Say how to resume a run that ended.")
     ] = True,
 ) -> None:
     """Discover a robot, move its joints, and identify topology, kinematic chain and inertia.
 
-    With --viewer serve its page is served on after the end, until Ctrl-C.
+    --json writes the same document as result.json. With --viewer serve its page is served on after the end,
+    until Ctrl-C.
     Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 5 sensors are sick, and
     the result is without their modules, or there is none; 130 interrupted.
     """
@@ -89,6 +92,7 @@ def run(
         with Terminal(at.quiet) as terminal:
             result, _ = run_attended(config, place, speed, terminal, advice)
         print_result(result, terminal)
+        write_result(json_file, result)
         terminal.console.print(f"written to {out}{report_at(out)}", markup=False, soft_wrap=True)
         stay()
     end_if_suspect(result.suspicions)
@@ -98,6 +102,7 @@ def replay(
     session: Annotated[Path, typer.Argument(help="A session.mcap, or the folder of a run.")],
     out: Annotated[Path | None, typer.Option(help="Folder for result.json [folder of the session].")] = None,
     report: WithReport = True,
+    json_file: JsonFile = None,
 ) -> None:
     """Compute the result of a run again from its recording, without a robot.
 
@@ -117,6 +122,7 @@ def replay(
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, identified)
     print_result(identified.result, terminal)
+    write_result(json_file, identified.result)
     if report:
         try:
             write_report(folder, recording, identified.result)

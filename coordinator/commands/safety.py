@@ -1,13 +1,15 @@
 """`x5-coordinator safety`: what a safety file says of each module, and the same in the other format."""
 
+from collections.abc import Mapping
 from math import isfinite, radians
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from coordinator.commands.options import JsonFile
 from coordinator.runtime.command_line import in_a_folder
-from coordinator.runtime.terminal import Terminal, new_table, print_table
+from coordinator.runtime.terminal import Terminal, new_table, print_table, write_result
 from module_agent.control.safety import Safety
 from module_agent.control.safety_file import read_safety, safety_toml, safety_xml
 from module_agent.model.errors import UsageError
@@ -31,6 +33,7 @@ def safety(
             help="Write the same limits to this file, .toml or .xml [only show them].", callback=in_a_folder
         ),
     ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Show the limits that a safety file gives to modules, and write them as TOML or as HEBI's XML.
 
@@ -45,12 +48,24 @@ def safety(
             raise UsageError(f"--out {out}: it must end in .toml or .xml")
         as_xml = out.suffix.lower() == ".xml"
         write_text(out, safety_xml(list(known.values())) if as_xml else safety_toml(known))
-    table = new_table(str(file), _COLUMNS)
-    for serial, one in known.items():
-        table.add_row(serial, *_shown(one))
-    print_table(table)
+    if write_result(json_file, [{"serial": s, **_limits(one.model_dump())} for s, one in known.items()]):
+        table = new_table(str(file), _COLUMNS)
+        for serial, one in known.items():
+            table.add_row(serial, *_shown(one))
+        print_table(table)
     if out is not None:
         Terminal().note(f"written: {out}")
+
+
+def _limits(fields: Mapping[str, Any]) -> dict[str, object]:
+    """Return limits for programs; None is the type's own, as an infinite one is no JSON."""
+
+    def known(value: object) -> object:
+        if isinstance(value, tuple):
+            return [known(one) for one in value]
+        return None if isinstance(value, float) and not isfinite(value) else value
+
+    return {name: known(value) for name, value in fields.items()}
 
 
 def _shown(one: Safety) -> tuple[str, ...]:

@@ -47,10 +47,19 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
     assert dynamics["gathered_difference"] <= AGREES_BELOW
 
     done = programs.run(
-        "coordinator.main", "replay", str(real / "session.mcap"), "--out", str(again), "--no-report"
+        "coordinator.main",
+        "replay",
+        str(real / "session.mcap"),
+        "--out",
+        str(again),
+        "--no-report",
+        "--json",
+        "-",
     )
     assert done.returncode == 0, done.stderr
     assert (again / "result.json").read_bytes() == (real / "result.json").read_bytes()
+    # Standard output has the same and nothing else.
+    assert json.loads(done.stdout) == json.loads((real / "result.json").read_bytes())
 
     done = programs.run("sim.main", "run", ROBOT, "--virtual", "--out", str(virtual), *options)
     assert done.returncode == 0, done.stderr

@@ -1,5 +1,6 @@
 """`x5-coordinator safety`: what a file says is shown, and is the same in the other format."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,18 @@ def test_the_limits_of_every_module_are_shown_in_the_units_of_people(limits: Pat
     assert code == 0
     for words in ("-85.94 .. 57.3", "motor_off", "-68.75 .. 68.75", "-2 .. 3", "hold"):
         assert words in text
+
+
+def test_programs_read_the_limits_of_every_module_with_none_for_the_types_own(limits: Path) -> None:
+    code, text = run(limits, *SERIALS, "--json", "-")
+    assert code == 0
+    first, second = json.loads(text)
+    assert (first["serial"], second["serial"]) == ("A", "B")
+    assert first["position_rad"] == [-1.5, 1.0]
+    assert first["velocity_rad_s"] == [-1.2, 1.2]
+    assert first["effort_nm"] == [None, None]
+    assert second["effort_nm"] == [-2.0, 3.0]
+    assert (second["at_limit"], second["m_stop"]) == (["motor_off", "motor_off"], "hold")
 
 
 def test_limits_are_the_same_after_the_way_through_hebis_format_and_back(

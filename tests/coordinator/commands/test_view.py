@@ -122,11 +122,12 @@ def test_a_run_says_where_its_page_is_and_serves_it_after_its_end_until_ctrl_c(
 
     monkeypatch.setattr("coordinator.commands.run.run_attended", identified)
     options = ("--out", str(tmp_path / "run"), "--viewer", "serve", "--serve-port", str(page_port), *quiet)
-    done = CliRunner().invoke(app, ["run", *options])
+    done = CliRunner().invoke(app, ["run", *options, "--json", "-"])
     looking.join()
     assert done.exit_code == 0, done.output
     assert f"open {address(page_port)} in a browser" in done.stderr
-    assert address(page_port) not in done.stdout
+    # Standard output has nothing but the result.
+    assert Result.model_validate_json(done.stdout) == result
     assert served_after_the_end == [True]
     assert not viewer_process.listens("127.0.0.1", page_port)
 

@@ -300,6 +300,16 @@ def test_foxglove_messages_have_what_their_schemas_require(folder: Path) -> None
         assert module["position_command_rad"] is None
 
 
+@pytest.mark.parametrize(("to", "what"), [("csv", "rows"), ("foxglove", "samples")])
+def test_programs_are_told_what_was_written_and_what_is_missing(folder: Path, to: str, what: str) -> None:
+    said = folder / "said.json"
+    out = export(folder, to, "--json", str(said))
+    told = json.loads(said.read_text())
+    assert (told["file"], told["format"], told["modules"]) == (str(out), to, [SHOULDER, ELBOW])
+    assert told[what] == 2 * ROWS
+    assert told["missing"] == list(read_exported(folder).missing)
+
+
 # ---------------------------------------------------------------------- what is missing
 
 
