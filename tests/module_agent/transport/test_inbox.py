@@ -5,7 +5,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.transport.inbox import EVENT_BYTES, Inbox
+from module_agent.transport.inbox import EVENT_BYTES, LANE_BYTES, Inbox
 from module_agent.transport.transport import Event, Reply, Sample
 
 # A key of one letter and a payload of ten bytes.
@@ -63,7 +63,7 @@ def test_threads_that_put_at_once_lose_nothing_uncounted() -> None:
 
 
 def test_a_flood_on_one_key_pushes_out_nothing_of_another_even_when_all_is_full() -> None:
-    inbox = Inbox(100, lane_bytes=90 * SIZE, total_bytes=100 * SIZE)
+    inbox = Inbox(100, lane_bytes=90 * SIZE, total_bytes=100 * SIZE + 3 * LANE_BYTES)
     for number in range(1000):
         inbox.put(_event(number, "fg"[number % 2]))
     for number in range(20):
@@ -74,10 +74,10 @@ def test_a_flood_on_one_key_pushes_out_nothing_of_another_even_when_all_is_full(
 
 
 def test_many_and_long_keys_are_counted_and_have_their_turns() -> None:
-    inbox = Inbox(100, total_bytes=100 * (EVENT_BYTES + 1000))
+    inbox = Inbox(100, total_bytes=100 * (LANE_BYTES + EVENT_BYTES + 1000))
     for number in range(300):
         inbox.put(Sample(f"{number:03}" + "x" * 997, b""))
-    assert len(inbox) == 100
+    assert len(inbox) == inbox.lanes == 100
     assert inbox.dropped == 200
     turns = [inbox.drain(limit=40) for _ in range(3)]
     assert list(map(len, turns)) == [40, 40, 20]
@@ -88,6 +88,39 @@ def test_many_and_long_keys_are_counted_and_have_their_turns() -> None:
     for key in "bc":
         inbox.put(_event(0, key))
     assert {event.key for event in [*inbox.drain(limit=2), *inbox.drain(limit=2)]} == {"a", "b", "c"}
+
+
+def test_what_is_refused_leaves_no_lane_and_what_is_taken_takes_its_lane_along() -> None:
+    inbox = Inbox(100, lane_bytes=SIZE, total_bytes=4 * (SIZE + LANE_BYTES))
+    for _ in range(3):
+        for number in range(5000):
+            inbox.put(Sample(f"{number:04}", b"1234567"))
+        assert len(inbox) == inbox.lanes == 4
+        assert len(inbox.drain(limit=100)) == 4
+        assert inbox.lanes == 0
+    assert inbox.dropped == 3 * 4996
+
+
+def test_a_new_key_has_room_where_one_event_of_another_gives_way_with_its_lane() -> None:
+    inbox = Inbox(10_000, total_bytes=2 * (LANE_BYTES + EVENT_BYTES + 1001))
+    for name in "ab":
+        inbox.put(Sample(name, bytes(1000)))
+    inbox.put(_event(1, "c"))
+    assert inbox.lanes == 2
+    assert {event.key for event in inbox.drain()} < {"a", "b", "c"}
+    assert inbox.dropped == 1
+
+
+def test_an_inbox_that_has_refused_lets_in_again_what_fits() -> None:
+    inbox = Inbox(10_000, total_bytes=LANE_BYTES + 10 * SIZE)
+    for _ in range(3):
+        for number in range(20):
+            inbox.put(_event(number))
+        inbox.put(_event(0, "q"))
+        kept = inbox.drain(limit=100)
+        # For the lane of the second key events of the first give way.
+        assert sum(event.key == "q" for event in kept) == 1
+        assert len(kept) == 1 + 10 - -(-(LANE_BYTES + SIZE) // SIZE)
 
 
 def test_an_answer_is_kept_however_full_it_is() -> None:
