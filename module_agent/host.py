@@ -76,7 +76,7 @@ class HostedModule:
         self.firmware = Firmware(config, modules, index)
         self.observer = Observer(config.serial, config.boot, IMU_PRIORS[config.imu])
         self.inbox = Inbox(MAX_MESSAGE_BYTES, bell=host.bell)
-        # Apart from all else, and read to its end in every tick, so that no flood can keep a stop out.
+        # Apart from all else, and read to its end in every tick: no flood of garbage keeps a stop out.
         self.stops = Inbox(TOPICS[Leaf.STOP].max_bytes_to_module, bell=host.bell)
         self.now_ns = 0
         self.requests: dict[int, Request] = {}
@@ -93,7 +93,18 @@ class HostedModule:
 
     def sink(self, leaf: Leaf) -> Sink:
         """Return the inbox of a leaf."""
-        return self.stops.put if leaf is Leaf.STOP else self.inbox.put
+        return self._put_stop if leaf is Leaf.STOP else self.inbox.put
+
+    def _put_stop(self, event: Event) -> None:
+        """Enqueue what arrives on the key of stops: garbage with all else, which refuses it in its turn."""
+        if not isinstance(event, Request | Sample):
+            return
+        try:
+            self.firmware.admission.read(Leaf.STOP, event.payload)
+        except WireError:
+            self.inbox.put(event)
+        else:
+            self.stops.put(event)
 
     def collect(self) -> bool:
         """Take what has arrived by now, if anything; its age is judged by the time of the next sample."""

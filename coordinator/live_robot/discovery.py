@@ -7,13 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
-from coordinator.live_robot.messenger import Clock, Messenger
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused
 from coordinator.recording.recording import Entry, Recording
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Event, Liveness, Reply, Sample, Transport
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Ask, Identify, Info, Message, Status, Stop
+from module_agent.wire.messages import Ack, Ask, Identify, Info, Message, Status
 from module_agent.wire.refusal import WireError
 
 ANSWER_S = 1.0
@@ -212,10 +212,25 @@ def light_led(transport: Transport, robot: str, serial: str, sender: str, on: bo
 
 def stop_robot(transport: Transport, robot: str, sender: str, search: Search) -> tuple[list[str], list[str]]:
     """Stop every module; return the serials that confirmed and those that did not. Closes the transport."""
+    try:
+        serials = _present(transport, robot, search)
+        confirmed = asyncio.run(_stop_all(transport, robot, sender, serials))
+    finally:
+        transport.close()
+    stopped = [serial for serial, stops in zip(serials, confirmed, strict=True) if stops]
+    return stopped, [serial for serial in serials if serial not in stopped]
 
-    def request(serial: str) -> Stop:
-        return Stop(serial=serial, boot=0, seq=1, sender=sender, why="stop command")
 
-    serials, answers = _ask_all(transport, robot, search, Leaf.STOP, request, Ack)
-    stopped = [s for s in serials if s in answers and answers[s].accepted]
-    return stopped, [s for s in serials if s not in stopped]
+async def _stop_all(transport: Transport, robot: str, sender: str, serials: list[str]) -> list[bool]:
+    """Return which modules confirm that they have stopped."""
+    post = asyncio.get_running_loop().call_soon_threadsafe
+    messenger = Messenger(transport, robot, time.monotonic_ns, post, Recording().accept)
+
+    async def confirms(serial: str) -> bool:
+        try:
+            await messenger.stop(serial, sender, "stop command")
+        except (NoAnswer, Refused):
+            return False
+        return True
+
+    return await asyncio.gather(*map(confirms, serials))

@@ -21,7 +21,7 @@ from module_agent.transport.transport import (
 )
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, encode
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Message
+from module_agent.wire.messages import Ack, Message, Stop
 from module_agent.wire.proof import proven
 from module_agent.wire.refusal import WireError
 from module_agent.wire.topics import HEARD_BY_COORDINATOR
@@ -33,6 +33,7 @@ Clock = Callable[[], int]
 Post = Callable[[Callable[[], None]], object]
 # Of one module's key, and of all: 40 s of feedback, and 30 s of that of 64 modules.
 LANE_BYTES, INBOX_BYTES = 1 << 21, 1 << 26
+STOP_ATTEMPTS, STOP_ANSWER_S = 3, 0.3
 Record = Callable[[Entry], Message | None]
 
 
@@ -200,6 +201,21 @@ class Messenger:
         if not answer.accepted:
             raise Refused(serial, leaf, answer)
         return answer
+
+    async def stop(self, serial: str, sender: str, why: str) -> None:
+        """Stop a module, which needs no lease; asked again while no answer comes, as a network may lose it.
+
+        Raises:
+            Refused, NoAnswer: see `command`.
+        """
+        for left in reversed(range(STOP_ATTEMPTS)):
+            stop = Stop(serial=serial, boot=0, seq=self.next_seq(), sender=sender, why=why)
+            try:
+                await self.command(serial, Leaf.STOP, stop, STOP_ANSWER_S)
+                return
+            except NoAnswer:
+                if not left:
+                    raise
 
     def close(self) -> None:
         """Stop receiving and leave the network; messages that are not recorded yet are dropped."""

@@ -30,7 +30,6 @@ from module_agent.wire.messages import (
     Pattern,
     Setpoint,
     Status,
-    Stop,
 )
 from module_agent.wire.refusal import Refusal
 
@@ -326,7 +325,7 @@ class ModuleGroup:
         # Not the modules whose lease another coordinator has taken.
         held = [serial for serial in self._tokens if serial not in self._taken_by]
         self._tokens.clear()
-        stops = (stop_module(self._messenger, self.sender, serial, why) for serial in held)
+        stops = (self._messenger.stop(serial, self.sender, why) for serial in held)
         done = await asyncio.gather(*stops, return_exceptions=True)
         return [s for s, r in zip(held, done, strict=True) if isinstance(r, BaseException)]
 
@@ -496,22 +495,6 @@ class ModuleGroup:
             if await self.wait(lambda: received() is not None, 0.3):
                 break
         return received()
-
-
-async def stop_module(messenger: Messenger, sender: str, serial: str, why: str) -> None:
-    """Stop a module, whichever program holds its lease; a network may lose the first two stops or answers.
-
-    Raises:
-        NoAnswer, Refused: it does not confirm.
-    """
-    for left in reversed(range(3)):
-        stop = Stop(serial=serial, boot=0, seq=messenger.next_seq(), sender=sender, why=why)
-        try:
-            await messenger.command(serial, Leaf.STOP, stop, timeout_s=0.3)
-            return
-        except NoAnswer:
-            if not left:
-                raise
 
 
 def _unfinished(motion: MotionRecord | None) -> str:

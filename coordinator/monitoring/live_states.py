@@ -5,7 +5,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Sender, gather_all
-from coordinator.live_robot.module_group import ModuleGroup, stop_module
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from module_agent.model.errors import RobotError
 from module_agent.wire.keys import Leaf
@@ -97,7 +97,7 @@ class LiveStates:
     async def _stop(self) -> None:
         serials = sorted(self._messenger.alive)
         try:
-            await gather_all(stop_module(self._messenger, self._sender.name, s, "asked to") for s in serials)
+            await gather_all(self._messenger.stop(s, self._sender.name, "asked to") for s in serials)
             self._note(f"stopped: {', '.join(serials) or 'no module is there'}")
         finally:
             await self._release()

@@ -131,7 +131,7 @@ class Admission:
         self.refusals[reason.value] = self.refusals.get(reason.value, 0) + 1
 
     def read(self, leaf: Leaf, payload: bytes) -> Message:
-        """Decode what arrived on a leaf and is meant for this module in this boot.
+        """Decode what arrived on a leaf and is meant for this module in this boot; from any thread.
 
         Raises:
             WireError: with the reason.

@@ -1,6 +1,7 @@
 """The contract of a transport, and the events that it delivers.
 
-A transport delivers every event by calling a `Sink`, from any thread: a sink must only enqueue. Publishing
+A transport delivers every event by calling a `Sink`, from any thread: a sink must only enqueue, after a look
+into the event at most. Publishing
 never blocks for long and may drop; a query is answered by exactly one `Reply`. Implementations: Zenoh
 (`zenoh_transport`), the simulator's virtual network, and `impaired_transport`, which wraps either.
 

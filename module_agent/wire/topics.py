@@ -96,6 +96,8 @@ TOPICS: dict[Leaf, Topic] = {
         published_by="coordinator",
         request=Stop,
         any_boot=True,
+        # The longest has 889; read at the door of the module, in the thread of the network.
+        max_bytes_to_module=1024,
     ),
     Leaf.GAINS: Topic("Replace the controller's gains.", request=GainsCommand),
     Leaf.IDENTIFY: Topic(

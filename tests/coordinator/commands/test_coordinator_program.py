@@ -325,6 +325,35 @@ def test_every_module_is_stopped_and_who_does_not_confirm_is_named(wire: Any) ->
     assert robot.stopped == ["A", "B"]
 
 
+@pytest.mark.parametrize(("lost", "stops"), [(2, True), (3, False)])
+def test_a_stop_that_the_network_loses_is_sent_again(wire: Any, lost: int, stops: bool) -> None:
+    class Lossy(Robot):
+        """A network that loses the first answers."""
+
+        def query(self, at: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
+            nonlocal lost
+            lost -= 1
+            if lost >= 0:
+                sink(Reply(tag, at, None, "Timeout"))
+            else:
+                super().query(at, payload, timeout_s, sink, tag)
+
+    robot: Any = Lossy(wire, ("A",))
+    assert stop_robot(robot, "arm", "tester", QUICK) == ((["A"], []) if stops else ([], ["A"]))
+    assert robot.closed
+
+
+def test_a_module_that_refuses_to_stop_is_not_counted_as_stopped(wire: Any) -> None:
+    class Refusing(Robot):
+        """Its module refuses."""
+
+        def answer(self, serial: str, at: str, payload: bytes) -> bytes:
+            return encode(self.wire.ack(serial=serial, accepted=False))
+
+    robot: Any = Refusing(wire, ("A",))
+    assert stop_robot(robot, "arm", "tester", QUICK) == ([], ["A"])
+
+
 def test_a_search_ends_with_the_last_module_that_is_expected(wire: Any) -> None:
     robot: Any = Robot(wire, ("A", "B", "C"))
     statuses = listed(robot, "arm", QUICK._replace(expect=2), listen_s=0.1).statuses
