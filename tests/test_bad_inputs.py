@@ -7,9 +7,18 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from coordinator.attendant.workspace import load_workspace
+from coordinator.excitation.plan import load_plan
 from coordinator.main import app as coordinator
+from module_agent.control.safety_file import read_safety
 from module_agent.main import app as agent
+from module_agent.model.errors import UsageError
+from module_agent.model.settings import read_settings
+from module_agent.network_emulation.profile_file import load_network
+from module_agent.transport.credentials import load_fleet
 from sim.main import app as sim
+from sim.robot.robot_file import load_robot
+from sim.world.external_force import parse_push
 
 PROGRAMS = {"x5-coordinator": coordinator, "x5-sim": sim, "x5-agent": agent}
 ROBOT = "thesis_171_horizontal"
@@ -25,6 +34,11 @@ CONTENTS: dict[str, bytes | None] = {
     "deep.json": b"[" * 20_000,
     "types.toml": b'name = 3\nmodules = "many"\nrate_hz = -1\n',
     "huge.toml": b"delay_s = 1e999\nseed = 99999999999999999999999999\nloss = nan\n",
+    "deep.toml": b"a = " + b"[" * 20_000,
+    "dotted.toml": b".".join([b"a"] * 100) + b" = 1\n",
+    "digits.toml": b"seed = 1" + b"0" * 5_000,
+    "hexadecimal.toml": b"seed = 0x1" + b"0" * 5_000,
+    "deep.xml": b"<a>" * 20_000,
     "numbers.csv": b"t,q,tau\n0,nan,1\n-1,inf,x\n",
     "robot.xml": b'<robot name="r"><link name="a"/><joint name="j" type="flying"/></robot>',
 }
@@ -54,6 +68,12 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "safety BAD A --out NEW",
         "export BAD --to csv --out NEW",
         "view BAD",
+        "import BAD --type X5-4 --out NEW",
+        "gains load BAD",
+        "identify A --network BAD",
+        "check-link --network BAD",
+        "attend BAD",
+        "attend . --may-move --workspace BAD",
     ),
     "x5-sim": (
         "run BAD --virtual --out NEW",
@@ -65,10 +85,16 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         f"run {ROBOT} --virtual --out NEW --plan BAD",
         f"run {ROBOT} --virtual --out NEW --network BAD",
         f"run {ROBOT} --virtual --out NEW --noise BAD",
+        f"run {ROBOT} --virtual --out NEW --safety BAD",
+        "watch --robot BAD --out NEW",
+        "faults --seeds 1..1 --robot BAD",
+        "faults --seeds 1..1 --network BAD",
+        "faults --seeds 1..1 --fault BAD",
     ),
     "x5-agent": (
         "--serial A --bus NEW --network BAD",
         "--serial A --bus NEW --secure BAD",
+        "--serial A --bus NEW --safety BAD",
     ),
 }
 # Options that are nonsense; the files are not read.
@@ -85,6 +111,16 @@ OPTIONS: dict[str, tuple[str, ...]] = {
         *(f"keys A --out NEW --days {value}" for value in ("-1", "0", "x", "1e9")),
         "keys A/B --out NEW",
         "keys A A/* --out NEW",
+        *(
+            f"attend BAD --{name} {value}"
+            for name in ("for", "alarms-per-hour")
+            for value in ("-1", "nan", "x")
+        ),
+        *(f"{name} --for {value}" for name in ("identify A", "check-link") for value in ("-1", "nan", "x")),
+        *(f"check-link --expect {value}" for value in ("0", "-3", "x")),
+        "gains load",
+        "identify",
+        "import",
         "run",
         "replay",
         "merge",
@@ -103,6 +139,14 @@ OPTIONS: dict[str, tuple[str, ...]] = {
         *(f"faults --seeds {value}" for value in ("x", "5..1", "-3..-1", "1..", "")),
         *(f"benchmark kinematics --trials {value}" for value in ("0", "-1", "x")),
         *(f"monitoring --hours {value}" for value in ("-1", "x")),
+        *(
+            f"watch --out NEW --{name} {value}"
+            for name in ("hours", "trials")
+            for value in ("-1", "nan", "x")
+        ),
+        *(f"watch --out NEW --{name} pigeons" for name in ("kind", "robot", "noise")),
+        *(f"faults --seeds 1..1 --{name} pigeons" for name in ("fault", "robot", "network")),
+        f"faults --seeds 1..1 --robot {ROBOT} --modules 1",
         "thesis --only figure9999",
         "benchmark kinematics --only pigeons",
         "compare-log",
@@ -180,3 +224,45 @@ def test_nonsense_is_refused(
     refused: Callable[[str, str, Path], str], tmp_path: Path, program: str, command: str
 ) -> None:
     refused(program, command, tmp_path / "missing")
+
+
+# TOML that the parser of Python cannot read, or that no setting can be: what is said of it.
+NO_TOML = {
+    "deep.toml": ":1: nested deeper than 16 levels",
+    "dotted.toml": ":1: a.a.",
+    "lines.toml": ":3: nested deeper than 16 levels",
+    "digits.toml": ":2: an integer of more than 64 bits",
+    "hexadecimal.toml": ":2: seed: an integer of more than 64 bits",
+}
+TOML_CONTENTS = {
+    **{name: CONTENTS[name] for name in ("deep.toml", "dotted.toml")},
+    "lines.toml": b"robot = 'arm'\n\na = [\n" + b"[\n" * 20_000,
+    **{name: b"robot = 'arm'\n" + (CONTENTS[name] or b"") for name in ("digits.toml", "hexadecimal.toml")},
+}
+READERS: dict[str, Callable[[Path], object]] = {
+    "settings": lambda path: read_settings({"X5_SETTINGS": str(path)}, path.parent),
+    "settings of the folder": lambda path: read_settings({}, path.rename(path.parent / "x5.toml").parent),
+    "plan": load_plan,
+    "workspace": load_workspace,
+    "network": load_network,
+    "fleet": lambda path: load_fleet(path.rename(path.parent / "fleet.toml").parent),
+    "safety": lambda path: read_safety(path, ["A"]),
+    "robot": load_robot,
+    "push": lambda path: parse_push(path.read_text().splitlines()[-1]),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("name", NO_TOML)
+def test_toml_that_cannot_be_read_is_refused_with_its_line(tmp_path: Path, reader: str, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(TOML_CONTENTS[name])
+    with pytest.raises(UsageError) as refused:
+        READERS[reader](path)
+    said = str(refused.value)
+    if reader == "push":
+        # An option, not a file: it is one line.
+        assert said.count(" is no push:1:") == 1
+    else:
+        assert NO_TOML[name] in said
+        assert str(tmp_path) in said

@@ -7,7 +7,6 @@ out, and return to where it stood, so that it does not fall when its motors are 
 not known only the joints' ranges and how far they can reach are.
 """
 
-import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
@@ -24,6 +23,7 @@ from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import UsageError
 from module_agent.model.forward_kinematics import body_displacements
+from module_agent.model.toml_location import read_toml
 from module_agent.wire.messages import ConstantMotion, GoTo, Pattern
 
 # Half an X5's housing, with cables.
@@ -114,12 +114,9 @@ def load_workspace(path: Path) -> Workspace:
     Raises:
         UsageError: the file cannot be read, is not TOML, or is no workspace; the message names the key.
     """
+    table, _ = read_toml(path)
     try:
-        return Workspace.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is not TOML: {error}") from error
+        return Workspace.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

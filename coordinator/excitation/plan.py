@@ -1,6 +1,5 @@
 """The settings of a session: which motions, how large, how long."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind
 from module_agent.model.errors import UsageError
+from module_agent.model.toml_location import read_toml
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
 Mode = Literal["joint", "simultaneous"]
@@ -127,15 +127,11 @@ def load_plan(path: Path) -> Plan:
     Raises:
         UsageError: the file cannot be read, is not TOML, or sets nothing, something unknown or out of range.
     """
+    table, _ = read_toml(path)
+    if not table:
+        raise UsageError(f"{path} sets nothing; for the default plan give none")
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-        if not table:
-            raise UsageError(f"{path} sets nothing; for the default plan give none")
         return Plan.model_validate(table)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is not TOML: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])

@@ -8,13 +8,13 @@ working folder, or the one that `X5_SETTINGS` names; empty, it names none:
     secure = "keys"                      # relative to the file
 """
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from module_agent.model.errors import UsageError
 from module_agent.model.suggestion import did_you_mean
+from module_agent.model.toml_location import read_toml
 
 FILE, PREFIX = "x5.toml", "X5_"
 SETTINGS_VARIABLE = "X5_SETTINGS"
@@ -49,13 +49,12 @@ def read_settings(environment: Mapping[str, str], folder: Path) -> dict[str, Any
     path = folder / FILE if named is None else Path(named)
     if named == "" or (named is None and not path.is_file()):
         return {}
-    try:
-        found = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{SETTINGS_VARIABLE} names {path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is no TOML: {error}") from error
-    return {name.replace("-", "_"): _checked(path, name, value) for name, value in found.items()}
+    table, _ = read_toml(path, UsageError if named is None else _named)
+    return {name.replace("-", "_"): _checked(path, name, value) for name, value in table.items()}
+
+
+def _named(fault: str) -> UsageError:
+    return UsageError(f"{SETTINGS_VARIABLE} names {fault}")
 
 
 def _checked(path: Path, name: str, value: object) -> object:

@@ -17,7 +17,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import fault_lines, faults_of, parse_toml
+from module_agent.model.toml_location import fault_lines, faults_of, read_toml
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.trace import TraceError, read_trace
 
@@ -53,11 +53,7 @@ def load_network(path: Path) -> NetworkProfile:
     Raises:
         NetworkError: the file cannot be read or describes no network; the message names file, line and key.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise NetworkError(f"{path}: cannot be read: {error}") from error
-    table = parse_toml(text, str(path), NetworkError)
+    table, text = read_toml(path, NetworkError)
     if not table:
         raise NetworkError(f"{path} sets nothing; for an undisturbed network give none")
     data = {"name": path.stem} | table

@@ -14,7 +14,6 @@ observer       hear every module; ask for what changes nothing; stop any module
 =============  ============================================================================================
 """
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from module_agent.model.errors import UsageError
+from module_agent.model.toml_location import read_toml
 from module_agent.wire.keys import ROOT, Leaf
 from module_agent.wire.topics import PUBLISHED_BY_MODULE, PUBLISHED_TO_MODULE, SERVED
 
@@ -106,14 +106,13 @@ def load_fleet(folder: Path) -> Fleet:
         UsageError: the folder holds none, or it is malformed.
     """
     path = folder / FLEET
-    try:
-        return Fleet.model_validate(tomllib.loads(path.read_text()))
-    except FileNotFoundError as error:
+    if not path.exists():
         raise UsageError(
             f"--secure {folder}: no {FLEET} in it; `x5-coordinator keys --out {folder}` makes such a folder"
-        ) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"{path}: {error}") from error
+        )
+    table, _ = read_toml(path)
+    try:
+        return Fleet.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
         raise UsageError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error

@@ -1,14 +1,13 @@
 """Pushes: external wrenches on a simulated robot, as of a hand or an obstacle, for a limited time."""
 
 import re
-import tomllib
 from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field, ValidationError, model_validator
 
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import faults_of
+from module_agent.model.toml_location import faults_of, parse_toml
 from sim.geometry.link_parts import Strict, Xyz
 
 _NOTHING = (0.0, 0.0, 0.0)
@@ -62,14 +61,13 @@ def parse_push(text: str) -> Push:
         UsageError: the text is no push; the message names the key that is wrong.
     """
     quoted = _UNQUOTED_SERIAL.sub(r'serial="\1"', text)
+    said = f"{text!r} is no push"
+    table = parse_toml(f"push = {{{quoted}}}", said, lambda fault: UsageError(f"{fault}; one is {_EXAMPLE}"))
     try:
-        table: object = tomllib.loads(f"push = {{{quoted}}}")["push"]
-        return Push.model_validate(table)
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{text!r} is no push: {error}; one is {_EXAMPLE}") from error
+        return Push.model_validate(table["push"])
     except ValidationError as error:
         faults = "; ".join(f"{at[0]}: {reason}" if at else reason for at, reason in faults_of(error))
-        raise UsageError(f"{text!r} is no push: {faults}; one is {_EXAMPLE}") from error
+        raise UsageError(f"{said}: {faults}; one is {_EXAMPLE}") from error
 
 
 def check_pushed(push: Push, serials: Sequence[str]) -> None:

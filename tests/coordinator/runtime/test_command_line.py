@@ -190,7 +190,7 @@ def test_a_file_is_named_by_a_variable_and_its_folder_is_that_of_the_keys(
         ('robo = "a"', "there is no setting 'robo' (did you mean 'robot'?)"),
         ("robot = 3", "robot = 3; str is needed"),
         ("connect = [3]", "connect = [3]; str or list is needed"),
-        ("robot", "is no TOML"),
+        ("robot", "not TOML"),
     ],
 )
 @pytest.mark.parametrize("program", [APP, agent])
