@@ -5,6 +5,7 @@ test_credentials.py`: without `--secure` they succeed where nothing on the netwo
 """
 
 import time
+from collections import deque
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,23 @@ import numpy as np
 import pytest
 
 from coordinator.live_robot.authority import make_credentials
+from coordinator.recording.run_folder import SESSION, load_recording
 from module_agent.model.errors import EXIT_USAGE
-from module_agent.transport.credentials import OBSERVER, host_credentials, load_credentials
-from module_agent.transport.transport import Request
-from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
-from module_agent.wire.codec import decode, encode
+from module_agent.transport.credentials import COORDINATOR, OBSERVER, host_credentials, load_credentials
+from module_agent.transport.transport import NoHub, Request
+from module_agent.transport.zenoh_transport import ZenohConfig, ZenohTransport, open_zenoh
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, key
-from module_agent.wire.messages import LeaseRequest, Setpoint, Status
+from module_agent.wire.messages import Feedback, LeaseRequest, Setpoint, Status
 from module_agent.wire.refusal import WireError
+from sim.faults.invariants import RESOLUTION_MM, SIGMAS
 from sim.scoring.score import score
 from sim.world.truth import read_motion
 
 ROBOT = "thesis_171_horizontal"
+G_M_S2 = 9.81
+GARBAGE = b"garbage"
 
 
 @pytest.fixture
@@ -107,15 +113,86 @@ def test_what_is_published_lets_nobody_act_in_the_holders_name(launcher, client,
     assert score(robot.config.out).topology_correct
 
 
-def test_with_security_the_robot_identifies_itself_among_intruders(secured, programs, endpoint) -> None:
-    """An observer and a hostile module with a certificate attack all the time; nothing of it arrives."""
+class Forger:
+    """Hears a module's feedback and publishes false rows next to it, in its name.
+
+    They have the module's serial, boot, sequence, row numbers and times; encoder and gyroscope say the
+    opposite of the truth, and the accelerometer twice g. Of two rows of one number the later is kept.
+    """
+
+    def __init__(self, transport: ZenohTransport, serial: str):
+        self._transport, self._at = transport, key(ROBOT, serial, Leaf.FEEDBACK)
+        self._true: deque[bytes] = deque(maxlen=1)
+        self.forged: set[bytes] = set()
+        transport.subscribe(self._at, lambda event: self._hear(event.payload))
+
+    def _hear(self, payload: bytes) -> None:
+        # A session hears itself as well.
+        if payload not in self.forged and payload != GARBAGE:
+            self._true.append(payload)
+
+    def publish(self) -> None:
+        """Publish what is made of the newest true message, once."""
+        if not self._true:
+            return
+        true = decode(Feedback, self._true.pop(), MAX_MESSAGE_BYTES)
+        rows = unpack(true).copy()
+        for name in ("position_rad", "velocity_rad_s", "gyro_rad_s"):
+            rows[name] *= -1.0
+        rows["accel_m_s2"] = 2.0 * rows["accel_m_s2"][:, [1, 2, 0]]
+        false = encode(true.model_copy(update={"rows": rows.tobytes()}))
+        self.forged.add(false)
+        self._transport.publish(self._at, false)
+
+
+def recorded_forgeries(programs, session: Path, forgers: list[Forger]) -> int:
+    """Return how many of the false messages are in a recording."""
+    forged = set().union(*(forger.forged for forger in forgers))
+    return sum(entry.payload in forged for entry in programs.entries(session))
+
+
+def test_without_security_false_rows_become_those_of_the_module(launcher, client, programs) -> None:
+    """The positive control of the next test: the rows are well formed, and the coordinator believes them."""
+    robot = launcher(ROBOT)
+    robot.start_world()
+    coordinator = robot.start_coordinator(quiet=True)
+    robot.start_agents()
+    intruder = client(ROBOT)
+    serial = robot.config.serials[0]
+    forger = Forger(intruder.transport, serial)
+    intruder.motion(serial, "rest", 20, coordinator)
+
+    def has_forged() -> bool:
+        forger.publish()
+        return len(forger.forged) >= 30
+
+    programs.until(has_forged, "feedback of the module", coordinator)
+    robot.stop()
+    session = robot.config.out / SESSION
+    assert recorded_forgeries(programs, session, [forger]) >= 15
+    recording = load_recording(session)
+    assert recording.refused == {}
+    log = recording.modules[serial].rows
+    accel = np.linalg.norm(log.rows(log.first_row, log.end_row)["accel_m_s2"], axis=1)
+    # The module hangs still before it moves, and after that it is slow: nothing but a lie shows twice g.
+    assert np.sum(accel > 1.5 * G_M_S2) >= 15
+
+
+def test_with_security_the_robot_identifies_itself_among_intruders(
+    secured, programs, endpoint, tmp_path
+) -> None:
+    """An observer and a hostile module with a certificate attack all the time; nothing of it arrives.
+
+    Others, without a certificate or with one of another authority, are not let in.
+    """
     robot, folder = secured
     serial = robot.config.serials[0]
     robot.start_world()
     coordinator = start_hub(robot, programs)
     robot.start_agents()
-    listed = list_modules(programs, endpoint, folder)
-    assert listed.returncode == 0, listed.stderr
+    programs.until(
+        lambda: list_modules(programs, endpoint, folder).returncode == 0, "the modules", coordinator
+    )
     hostile = [
         open_zenoh(ZenohConfig(mode="client", connect=(endpoint,), connect_timeout_s=60.0, credentials=known))
         for known in (
@@ -123,21 +200,30 @@ def test_with_security_the_robot_identifies_itself_among_intruders(secured, prog
             load_credentials(folder, ROBOT, [OBSERVER]),
         )
     ]
+    forgers = [Forger(one, name) for one in hostile for name in robot.config.serials]
+    make_credentials(tmp_path / "foreign", ROBOT, [*robot.config.serials])
+    outsiders = (None, load_credentials(tmp_path / "foreign", ROBOT, [COORDINATOR]))
     answered: list[Request] = []
     heard: list[bytes] = []
     for one in hostile:
         one.serve(key(ROBOT, serial, Leaf.LEASE), lambda event: answered.append(event))
         one.subscribe(key(ROBOT, serial, Leaf.STATUS), lambda event: heard.append(event.payload))
     programs.until(lambda: heard, "a status", coordinator)
+    for outsider in outsiders:
+        config = ZenohConfig(mode="client", connect=(endpoint,), connect_timeout_s=1.5, credentials=outsider)
+        with pytest.raises(NoHub):
+            open_zenoh(config)
     while coordinator.process.poll() is None:
         latest = heard[-1]
         for one in hostile:
             # Statuses and rows of the module as of another, replayed, and garbage on every key of the robot.
             for name in (serial, robot.config.serials[1], "GHOST"):
                 one.publish(key(ROBOT, name, Leaf.STATUS), latest)
-                one.publish(key(ROBOT, name, Leaf.FEEDBACK), b"garbage")
-            one.publish(f"x5/{ROBOT}/**", b"garbage")
+                one.publish(key(ROBOT, name, Leaf.FEEDBACK), GARBAGE)
+            one.publish(f"x5/{ROBOT}/**", GARBAGE)
             one.query(key(ROBOT, serial, Leaf.LEASE), latest, 0.1, lambda event: None, 1)
+        for forger in forgers:
+            forger.publish()
         time.sleep(0.02)
     code, text = programs.ended(coordinator)
     for one in hostile:
@@ -147,8 +233,13 @@ def test_with_security_the_robot_identifies_itself_among_intruders(secured, prog
     robot.stop()
     result = score(robot.config.out)
     assert result.topology_correct
-    recorded = programs.entries(robot.config.out / "session.mcap")
-    assert not [entry for entry in recorded if entry.payload == b"garbage" or "GHOST" in entry.topic]
+    # The claim of the result covers the true link of the robot's file, in spite of all.
+    for link in result.links:
+        assert abs(link.link_length_error_mm) < max(SIGMAS * link.link_length_sigma_mm, RESOLUTION_MM)
+    assert all(len(forger.forged) >= 100 for forger in forgers)
+    assert recorded_forgeries(programs, robot.config.out / SESSION, forgers) == 0
+    recorded = programs.entries(robot.config.out / SESSION)
+    assert not [entry for entry in recorded if entry.payload == GARBAGE or "GHOST" in entry.topic]
 
 
 def test_anyone_of_the_fleet_stops_the_robot_and_nobody_else(secured, programs, endpoint, client) -> None:
