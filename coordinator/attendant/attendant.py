@@ -107,6 +107,7 @@ class Attendant:
             "payload": patience.payload_s,
             "unexplained": patience.unexplained_s,
         }
+        self._longest_s = max(patience.gone_s, patience.still_s)
         # Since when a module is there, or is not.
         self._since: dict[str, tuple[bool, int]] = {}
         self._present_ns: int | None = None
@@ -190,6 +191,7 @@ class Attendant:
             if was is None or was[0] != there:
                 # Of those that never were there, nothing is known before the beginning.
                 self._since[serial] = there, seen.t_ns
+        self._forget_strangers(seen.t_ns)
         if off != self._off:
             self._off = off
             say.append("no module is on the network any more" if off else "modules are on the network again")
@@ -204,6 +206,12 @@ class Attendant:
             say.append("all modules are as they are known again")
         self._structure = texts
         return say
+
+    def _forget_strangers(self, now_ns: int) -> None:
+        """Forget modules that are not of the robot and gone for so long that nothing waits for it."""
+        for serial, (there, since_ns) in list(self._since.items()):
+            if not there and serial not in self.known and self._lasts(now_ns, since_ns, self._longest_s):
+                del self._since[serial]
 
     def _settled(self, serial: str, there: bool, now_ns: int) -> bool:
         state, since_ns = self._since[serial]

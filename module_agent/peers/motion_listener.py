@@ -130,6 +130,7 @@ class MotionListener:
         if serial in self._tracks or now_ns - self._heard_ns[serial] < FORGET_NS:
             return False
         del self._boot[serial], self._heard_ns[serial]
+        self._finished.pop(serial, None)
         return True
 
     def on_status(self, status: Status, now_ns: int, own_ns: Mapping[str, int]) -> None:

@@ -109,6 +109,17 @@ def test_a_module_that_comes_back_in_time_is_no_change_any_more() -> None:
     assert story.heard("as they are known again")
 
 
+def test_strangers_that_come_and_go_leave_nothing_behind() -> None:
+    story = Story()
+    story.goes_on(20.0)
+    for number in range(100):
+        story.present = {**ARM, f"stranger-{number}": 1}
+        story.goes_on(LOOK_S)
+    story.present = ARM
+    assert story.goes_on(WAIT.gone_s + WAIT.still_s) is None
+    assert story.attendant._since.keys() == ARM.keys()
+
+
 def test_a_robot_that_is_switched_off_and_on_is_no_other_robot() -> None:
     story = Story()
     story.goes_on(20.0)

@@ -358,6 +358,16 @@ def test_modules_that_were_made_up_do_not_keep_others_out_for_ever() -> None:
     assert len(listener._boot) == len(listener._heard_ns) == MAX_MODULES
 
 
+def test_what_was_heard_of_modules_that_were_made_up_is_forgotten_with_them() -> None:
+    listener = MotionListener()
+    for number in range(5 * MAX_MODULES):
+        serial, now_ns = f"M{number}", number * FORGET_NS
+        # A motion without rows is whole at once.
+        listener.on_status(_status(_record(start=5, end=5), serial=serial), now_ns, OWN)
+        listener.poll(now_ns)
+    assert len(listener._finished) == len(listener._boot) == MAX_MODULES
+
+
 def test_of_a_motion_without_an_end_no_more_rows_are_kept_than_of_any_other() -> None:
     listener = MotionListener()
     listener.on_status(_status(_record(start=1000, end=None, outcome="running")), 0, OWN)
