@@ -116,7 +116,9 @@ def tick(
     for i in range(len(modules)):
         own, now_ns = modules[i], times[i, T_NS]
         results[i] = NOT_QUIET
-        if not own.ready or not _is_quiet(own, now_ns, integers[i, NOW_NS], readings[i], most[i]):
+        imu_ns, before_ns, imu_before_ns = times[i, IMU_NS], integers[i, NOW_NS], integers[i, LAST_IMU_NS]
+        is_imu_possible = imu_before_ns <= imu_ns <= now_ns
+        if not (own.ready and is_imu_possible and _is_quiet(own, now_ns, before_ns, readings[i], most[i])):
             others += 1
             continue
         integers[i, LIMITED] |= integers[i, LIMIT]
@@ -127,7 +129,7 @@ def tick(
         pwm = _drive(own, loops[i], memory[i], floats[i], integers[i], readings[i])
         floats[i, PWM] = pwm
         results[i] = QUIET
-        if _row_due(own, now_ns, times[i, IMU_NS], integers[i]):
+        if _row_due(own, now_ns, imu_ns, integers[i]):
             _fill(rows[i], own, times[i], readings[i], floats[i])
             results[i] = ROW_DUE
         integers[i, NOW_NS] = now_ns

@@ -3,8 +3,12 @@
 A value that is no number, or that no working module of the type can read, is replaced by the last good one:
 a single bad sample then costs nothing. When it goes on for `MAX_HELD` samples it is a fault, which names the
 sensor, its value and what is possible; it lasts as long as the sensor is bad.
+
+So it is with the time of the IMU: it goes back only with the module's clock, and is never ahead of it.
+Readings of an impossible time are held over with their time, as they would belong to another instant.
 """
 
+import math
 from operator import le
 
 from module_agent.hardware.hardware import SensorSample
@@ -19,6 +23,8 @@ _TURNS_RAD, _DEFLECTION_RAD, _CURRENT_A, _VOLTAGE_V = 1e4, 10.0, 200.0, 100.0
 _GYRO_RAD_S, _ACCELERATION_M_S2 = 500.0, 5e4
 _HOT_C = 400.0
 _TIMES = 2
+_IMU_T_NS = SensorSample._fields.index("imu_t_ns")
+_IMU = tuple(k for k, name in enumerate(SensorSample._fields) if name.startswith(("gyro", "accel")))
 
 
 class SampleCheck:
@@ -50,15 +56,28 @@ class SampleCheck:
     def checked(self, sample: SensorSample) -> SensorSample:
         """Return the sample, with the last good value in place of each bad one."""
         # A comparison with NaN is false.
-        if all(map(le, map(abs, sample[_TIMES:]), self.most)):
+        if self._earliest_imu_ns(sample) <= sample.imu_t_ns <= sample.t_ns and all(
+            map(le, map(abs, sample[_TIMES:]), self.most)
+        ):
             self._last, self._held, self.fault = sample, 0, ""
             return sample
         return self._replaced(sample)
 
+    def _earliest_imu_ns(self, sample: SensorSample) -> float:
+        """Return the earliest possible time of the IMU: any one when the module's clock has gone back."""
+        return self._last.imu_t_ns if sample.t_ns > self._last.t_ns else -math.inf
+
     def _replaced(self, sample: SensorSample) -> SensorSample:
         values = list(sample)
+        earliest_ns = self._earliest_imu_ns(sample)
+        if not earliest_ns <= sample.imu_t_ns <= sample.t_ns:
+            for index in _IMU:
+                values[index] = self._last[index]
+            values[_IMU_T_NS] = min(self._last.imu_t_ns, sample.t_ns)
+            if self._held >= MAX_HELD:
+                self.fault = f"imu_t_ns reads {sample.imu_t_ns}, possible are {earliest_ns} .. {sample.t_ns}"
         for index, most in enumerate(self.most, start=_TIMES):
-            if not abs(sample[index]) <= most:
+            if not abs(values[index]) <= most:
                 values[index] = self._last[index]
                 if self._held >= MAX_HELD:
                     name = SensorSample._fields[index]

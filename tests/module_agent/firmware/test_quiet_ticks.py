@@ -211,6 +211,14 @@ ACTIONS = st.one_of(
         st.sampled_from([float("nan"), float("inf"), 1e7]),
         st.integers(1, 9),
     ),
+    st.tuples(
+        # The IMU's time lies ahead of the tick's, or goes back.
+        st.just("sick"),
+        st.integers(0, 2),
+        st.just("imu_t_ns"),
+        st.sampled_from([1, 2**62, -1, -10 * MS]),
+        st.integers(1, 9),
+    ),
     st.tuples(st.just("hot"), st.integers(0, 2), st.floats(100.0, 160.0)),
     st.tuples(st.just("fast"), st.integers(0, 2), st.floats(-2.0, 2.0)),
     st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([-24.0, 0.0, 12.0, 24.0, 48.0])),
@@ -276,7 +284,8 @@ class Life:
         values["motor_velocity_rad_s"] += self._fast[k]
         name, value, left = self._sick.get(k, ("", 0.0, 0))
         if left:
-            values[name] = value
+            # A time that is wrong is so by an amount.
+            values[name] = (self._now if value > 0 else self._imu)[k] + value if name == "imu_t_ns" else value
             self._sick[k] = name, value, left - 1
         return SensorSample(**values)  # type: ignore[arg-type]
 

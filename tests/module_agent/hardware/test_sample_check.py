@@ -87,6 +87,74 @@ def test_before_a_good_sample_a_bad_one_is_a_fault_at_once_and_reads_as_at_rest(
     assert "deflection_velocity_rad_s reads nan" in check.fault
 
 
+IMU = ("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2")
+
+
+@pytest.mark.parametrize("imu_t_ns", [3, 10])
+def test_readings_of_an_imu_time_that_cannot_be_are_held_over_with_their_time_and_then_named(
+    imu_t_ns: int,
+) -> None:
+    """Earlier than the last one, or later than the module's own time."""
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    bad = SensorSample(9, imu_t_ns, *(0.2 * k for k in range(1, 16)))  # type: ignore[call-arg]
+    held = bad._replace(imu_t_ns=4, **{name: getattr(GOOD, name) for name in IMU})
+    for _ in range(MAX_HELD):
+        assert check.checked(bad) == held
+        assert (check.fault, check.is_clean) == ("", False)
+        bad = bad._replace(t_ns=bad.t_ns + 1, imu_t_ns=bad.imu_t_ns + (imu_t_ns == 10))
+        held = held._replace(t_ns=bad.t_ns)
+    check.checked(bad)
+    assert check.fault == f"imu_t_ns reads {bad.imu_t_ns}, possible are 4 .. {bad.t_ns}"
+    good = bad._replace(imu_t_ns=4)
+    assert check.checked(good) is good
+    assert check.fault == ""
+
+
+@pytest.mark.parametrize("imu_t_ns", [4, 9])
+def test_the_last_time_of_the_imu_and_that_of_the_sample_are_possible(imu_t_ns: int) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    sample = GOOD._replace(t_ns=9, imu_t_ns=imu_t_ns)
+    assert check.checked(sample) is sample
+
+
+@pytest.mark.parametrize("t_ns", [5, 2])
+def test_a_clock_that_goes_back_takes_the_time_of_the_imu_along(t_ns: int) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    back = GOOD._replace(t_ns=t_ns, imu_t_ns=1)
+    assert check.checked(back) is back
+
+
+def test_until_the_imu_is_read_by_a_clock_that_went_back_its_old_readings_are_of_now() -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    # What the IMU read last is still there, by the clock before.
+    assert check.checked(GOOD._replace(t_ns=2)) == GOOD._replace(t_ns=2, imu_t_ns=2)
+    assert check.checked(GOOD._replace(t_ns=3)) == GOOD._replace(t_ns=3, imu_t_ns=2)
+    new = GOOD._replace(t_ns=4, imu_t_ns=4)
+    assert check.checked(new) is new
+
+
+def test_before_a_good_sample_the_imu_was_read_at_the_zero_of_the_clock_or_later() -> None:
+    early = GOOD._replace(t_ns=1, imu_t_ns=-1)
+    check = SampleCheck(KIND)
+    assert check.checked(early) == early._replace(imu_t_ns=0, **dict.fromkeys(IMU, 0.0))
+    assert check.fault == "imu_t_ns reads -1, possible are 0 .. 1"
+    at_zero = GOOD._replace(t_ns=1, imu_t_ns=0)
+    assert SampleCheck(KIND).checked(at_zero) is at_zero
+
+
+def test_among_readings_that_are_held_over_one_that_was_bad_is_not_named() -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    bad = GOOD._replace(t_ns=9, imu_t_ns=10, accel_x_m_s2=math.nan)
+    for _ in range(MAX_HELD + 1):
+        assert check.checked(bad) == GOOD._replace(t_ns=9)
+    assert "imu_t_ns reads 10" in check.fault
+
+
 def test_a_quiet_tick_gives_the_values_that_are_held_over_next() -> None:
     check = SampleCheck(KIND)
     check.checked(GOOD)
