@@ -182,6 +182,9 @@ class ModuleGroup:
             except NoAnswer:
                 self.check()
                 if not left:
+                    # Of an agent that has died the network says at once that none answers, many times before
+                    # its silence shows.
+                    await self.wait(lambda: False, 1e-9 * SILENT_NS + POLL_S)
                     raise
             except Refused as refused:
                 if refused.ack.reason not in PASSING or not left:

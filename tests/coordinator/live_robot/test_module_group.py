@@ -170,6 +170,22 @@ def test_a_killed_agent_is_noticed_a_third_of_a_second_after_its_token(rigs: Cal
     assert 280e6 < rig.run(work()) < 360e6
 
 
+def test_a_question_to_an_agent_that_has_just_died_names_the_module_as_lost(
+    rigs: Callable[..., Any],
+) -> None:
+    """The network says at once, to every attempt, that none answers; its silence takes longer to tell."""
+    rig = rigs(ARM)
+    _, _, group = rig.group()
+
+    async def work() -> None:
+        await _met(group)
+        rig.kill(TIP)
+        with pytest.raises(ModuleLost, match=f"module {TIP} is lost: its agent has left the network"):
+            await group.ask_status(TIP)
+
+    rig.run(work())
+
+
 def test_a_frozen_agent_is_noticed_by_its_missing_feedback(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     _, _, group = rig.group()
