@@ -5,6 +5,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.recording.run_folder import SESSION, load_recording
+from coordinator.recording.run_folder import RESULT, SESSION, load_recording
 from module_agent.model.errors import EXIT_FAILED, EXIT_LOST
 from sim.processes.launcher import Child, Launcher
 from tests.integration.conftest import MARK, marked_processes
@@ -45,6 +46,33 @@ def kill_at(victim: Child, others: Child, session: Path, after_s: float) -> None
     victim.process.wait()
 
 
+def living() -> set[int]:
+    """Return the numbers of the processes that this test has started, at any depth, and that live."""
+    return {int(line.split(":")[0]) for line in marked_processes(os.environ[MARK])}
+
+
+def check_end(robot: Launcher, ended: Child, said: str, killed: Child) -> None:
+    """Check the exit code of a run of which a process was killed against the table in docs/guide.md."""
+    code = ended.process.returncode
+    assert "Traceback" not in said
+    if (robot.config.out / RESULT).exists():
+        # All had been recorded, and perhaps computed, before the kill.
+        assert code in ((0, -signal.SIGKILL) if ended is killed else (0,)), said
+    elif ended is killed:
+        assert code == -signal.SIGKILL
+    else:
+        # What follows it is how to go on.
+        last = [line for line in said.splitlines() if line.startswith("x5-coordinator: ")][-1]
+        serials = robot.config.serials
+        lost = [serial for serial in serials if f"module {serial} is lost: " in last]
+        assert code == (EXIT_LOST if lost else EXIT_FAILED), said
+        # From the first step on it is known who takes part, and so who is missing.
+        begun = any(event.what == "begin" for event in load_recording(robot.config.out / SESSION).journal)
+        assert lost or not begun, said
+        assert lost or any(serial in last for serial in serials) or "module expected, found " in last, said
+        assert killed.name == "world" or all(killed.name == f"agent {serial}" for serial in lost), said
+
+
 @pytest.mark.parametrize("seed", range(KILLS))
 def test_a_random_kill_has_a_named_end_and_the_run_resumes(
     launcher, programs, nothing_is_left, tmp_path, seed: int
@@ -56,7 +84,8 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
     if which == "launcher":
         launched = launch(robot, tmp_path / "launch.log")
         kill_at(launched, launched, session, after_s)
-        programs.until(lambda: not marked_processes(os.environ[MARK]), "the end of all that it had launched")
+        check_end(robot, launched, "", killed=launched)
+        programs.until(lambda: not living(), "the end of all that it had launched")
         # Only who is killed outright leaves the folder of its bus.
         for folder in nothing_is_left.glob("x5-*"):
             shutil.rmtree(folder)
@@ -65,12 +94,19 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
         coordinator = robot.start_coordinator(quiet=True)
         victim = {"coordinator": coordinator, "agent": agents[int(draw.integers(2))], "world": world}[which]
         kill_at(victim, coordinator, session, after_s)
-        if which != "coordinator":
-            code, said = programs.ended(coordinator)
-            # Lost, or of modules that are there not all were found to begin with.
-            assert code in (0, EXIT_FAILED, EXIT_LOST), said
-            assert "Traceback" not in said
-            assert code == 0 or any(serial in said for serial in robot.config.serials) or "module" in said
+        said = programs.ended(coordinator)[1]
+        check_end(robot, coordinator, said, victim)
+        if which == "world":
+            # Without a body there is no module: its agent says so and ends.
+            for agent in agents:
+                code, words = programs.ended(agent)
+                assert code == EXIT_LOST, words
+                assert "the modules are gone" in words
+            left = set()
+        else:
+            # Modules outlive their coordinator and one another: motors off, they wait for the next one.
+            left = {world.process.pid, *(agent.process.pid for agent in agents)} - {victim.process.pid}
+        programs.until(lambda: living() == left, f"just {left} of {marked_processes(os.environ[MARK])}")
     recording = load_recording(session)
     assert recording.damage == []
     robot.stop()
