@@ -111,8 +111,11 @@ class Attacked:
         if self.ticks - self.accepted > LIFETIME_MS + 2:
             assert state not in COMMANDED
         if state not in COMMANDED:
-            assert abs(pwm) <= (DAMPING_LIMIT_PWM if state == "stopped" and not self.is_limited else 1.0)
             assert pwm == 0.0 or state == "stopped"
+            # A limit of the type, such as that of the speed, may brake harder, as hard as the motor is fast.
+            share = self.share_of_speed
+            assert self.is_limited or abs(pwm) <= max(DAMPING_LIMIT_PWM, abs(share))
+            assert self.is_limited or pwm * share <= 0.0
         lease = self.bench.firmware.lease
         assert lease.holder in (None, holder) or lease.token == token + 1
         return answers
@@ -121,6 +124,14 @@ class Attacked:
     def is_limited(self) -> bool:
         """Whether a configured limit may push a braked joint, such as back into its range."""
         return self.bench.firmware.config.safety != UNCONFIGURED
+
+    @property
+    def share_of_speed(self) -> float:
+        """The motor's speed as it is read, over that of its type."""
+        firmware = self.bench.firmware
+        kind, sample = firmware.config.kind, firmware._sample
+        assert sample is not None
+        return sample.sensors.motor_velocity_rad_s / (kind.gear_ratio * kind.max_speed_rad_s)
 
     def tell(self, leaf: Leaf, message: Message, secret: bytes = b"") -> bool:
         """Send a message, checked by no model, as an attacker would; return whether it was accepted."""
