@@ -45,7 +45,7 @@ class Recorder:
         stream: where to.
         robot: the robot's name, shown above it.
         pace: how long data are gathered; of a killed run a file misses the last `period_ns`.
-        lays_out: send layouts at all.
+        lays_out: send layouts and the styles of the modules; without, another program has sent them.
     """
 
     def __init__(
@@ -267,8 +267,9 @@ class Recorder:
         new = [serial for serial in dict.fromkeys(serials) if serial not in self._contents.serials]
         if not new:
             return
-        for serial in new:
-            time_series.log_module_styles(self._stream, serial, self._palette[serial])
+        if self._lays_out:
+            for serial in new:
+                time_series.log_module_styles(self._stream, serial, self._palette[serial])
         self._contents = self._contents._replace(serials=(*self._contents.serials, *new))
         self._show()
 

@@ -48,7 +48,8 @@ class Viewer:
             run_id: the recording's identity; the same one in two processes makes one recording.
             targets: where to; with none at all, nothing is recorded and all calls do nothing.
             waits: if the queue is full, let calls wait instead of dropping data: for virtual time.
-            lays_out: send layouts; without, what is logged adds to a run that has its layout from elsewhere.
+            lays_out: send layouts and the modules' colours; without, what is logged adds to a run that has
+                them from elsewhere.
 
         Raises:
             OSError: the file cannot be written. A live viewer that cannot be reached is only reported.

@@ -1,5 +1,6 @@
 """A run whose coordinator did not know the truth has it in its recording when it is over."""
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,15 @@ from sim.robot.variants import as_built
 from sim.scoring.truth_recording import add_truth
 
 BASE, TIP = "X-00009", "X-00010"
+
+
+def styles(file: Path) -> Counter[str]:
+    """How often each entity has been given a style of its lines, colours among it."""
+    return Counter(
+        chunk.entity_path
+        for chunk in RrdReader(str(file)).stream()
+        if chunk.is_static and chunk.entity_path.startswith("/modules/")
+    )
 
 
 def table(file: Path, entity: str) -> pd.DataFrame:
@@ -40,7 +50,8 @@ def test_the_true_robot_turns_beside_the_identified_one(
     file = run / "session.rrd"
     before = {chunk.entity_path for chunk in RrdReader(str(file)).stream()}
     assert not [path for path in before if path.startswith("/world/true")]
-    layouts = len(RrdReader(str(file)).blueprints())
+    layouts, styled = len(RrdReader(str(file)).blueprints()), styles(file)
+    assert styled
     said: list[str] = []
     add_truth(run, None, said.append)
     assert said == []
@@ -49,6 +60,8 @@ def test_the_true_robot_turns_beside_the_identified_one(
     assert [entry.recording_id for entry in reader.recordings()] == ["run"]
     # It opens as it did, and nothing of it is lost.
     assert len(reader.blueprints()) == layouts
+    # Two programs that order the modules differently would give them other colours.
+    assert styles(file) == styled
     assert before < {chunk.entity_path for chunk in reader.stream()}
     length = table(file, f"/estimates/link_length/{TIP}/true")
     (values,) = [length[c].dropna() for c in length if c.endswith(":scalars")]
