@@ -124,11 +124,11 @@ def test_a_stop_by_somebody_else_a_dead_agent_and_a_large_error_stop_all_modules
 
     rig = rigs(ARM, "lan")
     following, _ = session(rig, model, path)
-    _, _, other = rig.group("other")
+    messenger, _, other = rig.group("other")
 
     async def stop() -> None:
         await other.meet([LIFT])
-        await other._stop(LIFT, "enough")
+        await messenger.stop(LIFT, other.sender, "enough")
 
     rig.when(lambda: streams(rig), lambda: rig.loop.create_task(stop()))
     with pytest.raises(RobotStopped, match=f"module {LIFT} was stopped by other: enough"):

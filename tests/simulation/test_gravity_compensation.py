@@ -265,14 +265,14 @@ def test_when_an_agent_dies_the_others_are_told_to_stop_and_it_is_named(rigs: Ca
 def test_somebody_elses_stop_ends_it_and_is_not_overruled(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     floating, seen = session(rig)
-    _, _, other = rig.group("other")
+    messenger, _, other = rig.group("other")
 
     async def both() -> None:
         work = asyncio.ensure_future(floating.run())
         while not seen.floats:
             await asyncio.sleep(0.05)
         await other.meet([LIFT])
-        await other._stop(LIFT, "enough")
+        await messenger.stop(LIFT, other.sender, "enough")
         await work
 
     with pytest.raises(RobotStopped, match=f"module {LIFT} was stopped by other: enough"):
