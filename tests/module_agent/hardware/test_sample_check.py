@@ -119,6 +119,14 @@ def test_the_last_time_of_the_imu_and_that_of_the_sample_are_possible(imu_t_ns: 
     assert check.checked(sample) is sample
 
 
+@pytest.mark.parametrize("imu_t_ns", [4, 9])
+def test_an_imu_that_was_read_at_a_possible_time_counts_next_to_a_bad_reading(imu_t_ns: int) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    sample = GOOD._replace(t_ns=9, imu_t_ns=imu_t_ns, gyro_x_rad_s=0.5, position_rad=math.nan)
+    assert check.checked(sample) == sample._replace(position_rad=GOOD.position_rad)
+
+
 @pytest.mark.parametrize("t_ns", [5, 2])
 def test_a_clock_that_goes_back_takes_the_time_of_the_imu_along(t_ns: int) -> None:
     check = SampleCheck(KIND)
