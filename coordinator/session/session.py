@@ -5,6 +5,7 @@ Steps are journaled; a resumed run skips the steps that are done.
 
 import asyncio
 import itertools
+import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Protocol
@@ -321,7 +322,9 @@ class Session:
         speed = self._plan.travel_speed_rad_s
 
         async def back() -> None:
-            goals = {s: self._starts[s] for s in self._excluded.movers() if s in self._starts}
+            goals = {
+                s: self._allowed(s, self._starts[s]) for s in self._excluded.movers() if s in self._starts
+            }
             await self.group.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in goals.items()})
 
         try:
@@ -538,6 +541,13 @@ class Session:
     def _position(self, serial: str) -> float:
         position_rad = self.group.position_rad(serial)
         return self._plan.home_rad if position_rad is None else position_rad
+
+    def _allowed(self, serial: str, position_rad: float) -> float:
+        """Return the position within a module's range: a joint may have stood, or fallen, outside of it."""
+        limits = self.group.info(serial).limits
+        low, high = limits.min_position_rad, limits.max_position_rad
+        low, high = -math.inf if low is None else low, math.inf if high is None else high
+        return min(max(position_rad, low), high)
 
     def _report(self, text: str) -> None:
         self._index += 1

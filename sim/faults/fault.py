@@ -46,7 +46,7 @@ NATURES: dict[str, Nature] = {
     "agent freeze": Nature("agent", "never"),
     "agent thaw": Nature("agent"),
     "agent reboot": Nature("agent"),
-    "twin": Nature("agent", "either", ("twice", "twin", "boot", "two")),
+    "twin": Nature("agent", "either", ("twice", "twin", "boot*", "two")),
     "hot plug": Nature("agent", "never"),
     "hot unplug": Nature("agent", "never"),
     "coordinator crash": Nature("coordinator", "never"),
@@ -106,6 +106,11 @@ class Fault(NamedTuple):
     def nature(self) -> Nature:
         """The row of its kind in the table."""
         return NATURES[self.kind]
+
+    @property
+    def begins_s(self) -> float:
+        """When something is other than usual: a module that is plugged in later is missing until then."""
+        return 0.0 if self.kind == "hot plug" else self.at_s
 
     @property
     def of_a_module(self) -> bool:

@@ -76,7 +76,7 @@ def _judged(schedule: Schedule) -> SeedReport:
         violations |= witness.violations | check_folder(Path(folder) / "run", ending)
     outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
     serials = schedule.robot.serials
-    begun = [fault for fault in schedule.faults if fault.at_s <= ending.at_s]
+    begun = [fault for fault in schedule.faults if fault.begins_s <= ending.at_s]
     named = any(fault.is_named(ending.text, serials) for fault in begun)
     return SeedReport(
         seed=schedule.seed,

@@ -1,6 +1,7 @@
 """Full PWM against a configured limit, judged by where the joints truly are."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from module_agent.control.safety import Safety
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import module_type
 from sim.robot.robot_file import load_robot
+from sim.virtual_time.robot import VirtualRobot
+from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from sim.world.world import World
 
 NAN = math.nan
@@ -92,3 +95,22 @@ def test_a_speed_limit_is_that_of_the_motor_with_and_against_gravity(sign: float
 def test_a_current_limit_holds_within_the_scatter_of_windings() -> None:
     amps = np.abs(Pushed("a2085_04", 0, current_a=0.4).push(1.0, 1.0)[:, 2])
     assert 0.36 < amps.max() < 0.44
+
+
+def test_a_joint_that_stood_outside_its_range_goes_back_to_the_end_of_it(tmp_path: Path) -> None:
+    """As one that has fallen before the session: the range does not allow to lead it out again."""
+    robot = load_robot("thesis_171_horizontal")
+    base, tip = robot.modules
+    robot = robot.model_copy(update={"modules": (base, tip.model_copy(update={"start_rad": 1.0}))})
+    ended: list[VirtualRobot] = []
+    config = VirtualConfig(
+        robot,
+        tmp_path / "run",
+        network="none",
+        noise="x5",
+        plan=QUICK_PLAN,
+        safety={tip.serial: Safety(position_rad=(-0.9, 0.9))},
+    )
+    run_virtual(config, between=ended.append)
+    # The module brakes a little before its limit, and the motor is off in the end.
+    assert 0.85 < ended[0].world.plant.q_rad[1] < 0.9

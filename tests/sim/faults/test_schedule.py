@@ -73,6 +73,7 @@ def test_a_fault_lasts_as_its_kind_does(text: str, words: str) -> None:
     [
         (Fault("twin", 1.0, math.inf, 0), "A: the network is slow", False),
         (Fault("twin", 1.0, math.inf, 0), "A answers under two boot ids", True),
+        (Fault("twin", 1.0, math.inf, 0), "module A is lost: it has booted anew", True),
         (Fault("clock drift", 1.0, math.inf, 0), "A: it sometimes did not answer", False),
         (Fault("clock drift", 1.0, math.inf, 0), "A: the clocks of A and B disagree", True),
         (Fault("torque stuck", 1.0, math.inf, 0), "AB: its effort is stuck", False),
