@@ -143,6 +143,15 @@ def test_a_winding_limit_is_a_fault_and_must_cool_by_14_k() -> None:
     assert one.acquire().accepted
 
 
+@pytest.mark.parametrize(("winding_c", "arms"), [(89.9, True), (90.0, False)])
+def test_a_winding_that_was_not_too_hot_is_armed_up_to_its_limit(winding_c: float, arms: bool) -> None:
+    one = bench(winding_c=90.0)
+    one.winding_c = winding_c
+    answer = one.acquire()
+    assert answer.accepted is arms
+    assert arms or refused(answer, Refusal.NOT_ARMED)
+
+
 # ------------------------------------------------------------------ M-stop
 
 

@@ -352,6 +352,10 @@ def test_a_stopped_joint_beyond_its_limit_is_braked_and_not_driven_back(sign: fl
     assert -1.0 <= sign * out.damping(reading(q=sign * 1.2, speed=sign * 0.3)) < 0.0
     assert sign * out.damping(reading(q=sign * 1.2, speed=-sign * 0.3)) >= 0.0
     assert abs(out.damping(reading(q=sign * 1.2, speed=sign * 1e-3))) < 1e-3
+    # Slower than it would be led back: what leads it back is no brake.
+    slow = reading(q=sign * 1.2, speed=-sign * 0.02)
+    assert sign * out.limit(0.0, slow) < -0.01
+    assert out.damping(slow) == 0.0
 
 
 # ------------------------------------------------------------------ whatever comes
