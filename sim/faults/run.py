@@ -118,7 +118,7 @@ class _Session:
         self._cable = CableState()
         self._disturbances: list[Fault] = []
         self._sender = COORDINATOR
-        self._restarts = False
+        self._restarts = self._killed = False
         self._full = 0
         self._strikers: dict[Fault, Intruder | RecklessHolder] = {}
         self._over = False
@@ -221,7 +221,9 @@ class _Session:
         loop.schedule_ns(loop.now_ns + round(for_s * NS_PER_S), call)
 
     def _kill(self, fault: Fault) -> None:
-        if self._sender == COORDINATOR:
+        """Kill the first coordinator, once: its successor is to come to its end."""
+        if not self._killed:
+            self._killed = True
             self._robot.network.kill(COORDINATOR)
             raise _Killed
 
