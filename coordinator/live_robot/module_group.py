@@ -378,7 +378,9 @@ class ModuleGroup:
             )
         started = {s: _Started(self._next_id(), pattern, fed.get(s)) for s, pattern in patterns.items()}
         await gather_all(self._start(serial, motion) for serial, motion in started.items())
-        longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
+        # Where the last other joint has been excluded, nothing is left to move.
+        durations_s = [duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items()]
+        longest = max(durations_s, default=0.0)
         ended = await self.wait(
             lambda: (
                 all(self._ended(serial, motion.number) for serial, motion in started.items())

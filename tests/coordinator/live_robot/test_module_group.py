@@ -328,6 +328,19 @@ def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Ca
     assert rig.state(BASE) == "stopped"
 
 
+def test_no_motion_at_all_is_done_at_once(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, _, group = rig.group()
+
+    async def work() -> dict[str, Any]:
+        keeper = await _armed(group)
+        done = await group.run({})
+        keeper.cancel()
+        return done
+
+    assert rig.run(work()) == {}
+
+
 @pytest.mark.parametrize("own", [True, False])
 def test_set_points_of_another_program_with_the_secret_are_named(rigs: Callable[..., Any], own: bool) -> None:
     rig = rigs(ARM, "lan")
