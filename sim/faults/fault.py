@@ -109,7 +109,7 @@ class Fault(NamedTuple):
 
     @property
     def begins_s(self) -> float:
-        """When something is other than usual: a module that is plugged in later is missing until then."""
+        """When it takes effect: a module that is plugged in later is missing until then."""
         return 0.0 if self.kind == "hot plug" else self.at_s
 
     @property
