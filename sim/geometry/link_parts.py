@@ -5,15 +5,15 @@ those of the simple solids named below.
 """
 
 from collections.abc import Sequence
-from math import cos, pi, sin, sqrt
-from typing import Annotated, NamedTuple, Self
+from math import pi, sqrt
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from module_agent.model.read_only import read_only
 from sim.geometry.pose import Array, pose
-from sim.geometry.rigid_body import RigidBody, joined, tensor
+from sim.geometry.rigid_body import RigidBody, joined, moved, tensor
 from sim.geometry.shape import Shape, box_between
 
 Length = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -23,6 +23,10 @@ Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
 Moment = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 _TUBE_RADIUS_M = 0.016
+# From the face of a right-angle end to the tube's axis.
+_TUBE_OFF_M = 0.02
+# Of both ends at right angles; and what an inline input and an inline output weigh more.
+_ENDS_KG, _INLINE_KG = 0.199, (0.015, 0.013)
 # 0.4 kg/m of aluminium (2700 kg/m^3) at that outer radius makes a wall of 1.6 mm.
 _TUBE_INNER_RADIUS_M = sqrt(_TUBE_RADIUS_M**2 - 0.4 / 2700.0 / pi)
 _PLATE_M = 0.006
@@ -60,11 +64,19 @@ class Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+End = Literal["right-angle", "inline"]
+
+
 class Tube(Strict):
-    """An X5 tube with right-angle ends; the far end is twisted about the tube."""
+    """An X5 tube; its far end is twisted about the tube.
+
+    At a right-angle end the tube runs along the face that it is bolted to, at an inline end along its normal.
+    """
 
     length_m: Annotated[float, Field(gt=0.0, le=3.0)]
     twist_rad: Annotated[float, Field(ge=-2 * pi, le=2 * pi)] = 0.0
+    input: End = "right-angle"
+    output: End = "right-angle"
 
 
 class Solid(Strict):
@@ -147,25 +159,38 @@ def _body(mass_kg: float, com: Sequence[float], inertia: Array) -> RigidBody:
 
 
 def _tube(tube: Tube) -> PlacedPart:
+    """Return a tube, which is made in a frame at the beginning of its axis, along x, and moved to `entry`."""
     length, twist = tube.length_m, tube.twist_rad
-    output = pose((length, -0.02 * sin(twist), 0.02 * (1.0 + cos(twist))), (twist, 0.0, 0.0))
+    off = pose((0.0, 0.0, _TUBE_OFF_M))
+    # The normal of an inline end's face is the tube's axis, and the face is where the length begins and ends.
+    entry = off if tube.input == "right-angle" else pose(rpy_rad=(0.0, -pi / 2, 0.0))
+    leave = off if tube.output == "right-angle" else pose(rpy_rad=(0.0, pi / 2, 0.0))
+    output = entry @ pose((length, 0.0, 0.0), (twist, 0.0, 0.0)) @ leave
     # A thin-walled tube, and its two cast ends as point masses, which together give the published mass
-    # 0.4 L + 0.199 kg with its centre in the middle.
-    walls, ends = 0.4 * length, 0.199
+    # 0.4 L + 0.199 kg, and a little more with inline ends, with its centre in the middle.
+    walls, ends = (
+        0.4 * length,
+        _ENDS_KG
+        + sum(
+            extra for end, extra in zip((tube.input, tube.output), _INLINE_KG, strict=True) if end == "inline"
+        ),
+    )
     along = walls * _TUBE_RADIUS_M**2 + ends * _TUBE_RADIUS_M**2
     across = walls * (length**2 / 12 + _TUBE_RADIUS_M**2 / 2) + ends * (length / 2) ** 2
-    body = _body(walls + ends, (length / 2, 0.0, 0.02), tensor(along, across, across, 0.0, 0.0, 0.0))
-    wall = Shape("cylinder", pose((length / 2, 0.0, 0.02), (0.0, pi / 2, 0.0)), (_TUBE_RADIUS_M, length))
-    return PlacedPart(output, body, _tube_hinge(length), (wall,))
+    body = _body(walls + ends, (length / 2, 0.0, 0.0), tensor(along, across, across, 0.0, 0.0, 0.0))
+    wall = Shape(
+        "cylinder", entry @ pose((length / 2, 0.0, 0.0), (0.0, pi / 2, 0.0)), (_TUBE_RADIUS_M, length)
+    )
+    return PlacedPart(output, moved(body, entry), _tube_hinge(length, entry), (wall,))
 
 
-def _tube_hinge(length_m: float) -> Hinge:
+def _tube_hinge(length_m: float, entry: Array) -> Hinge:
     """Return the hinge of a tube clamped at its input: bending about y, z, torsion about x (beam theory)."""
     area_moment = pi / 4.0 * (_TUBE_RADIUS_M**4 - _TUBE_INNER_RADIUS_M**4)
     bending = _HOWELL_STIFFNESS * _ALUMINIUM_E_PA * area_moment / length_m
     twisting = _ALUMINIUM_G_PA * 2.0 * area_moment / length_m
     stiffness = np.array([twisting, bending, bending])
-    place = pose((_HOWELL_HINGE * length_m, 0.0, 0.02))
+    place = entry @ pose((_HOWELL_HINGE * length_m, 0.0, 0.0))
     return Hinge(place, read_only(stiffness), read_only(stiffness * STRUCTURE_LOSS_S))
 
 

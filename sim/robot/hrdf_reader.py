@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import CATALOGUE
-from sim.geometry.link_parts import BRACKETS, FreePose, Part, Tube, placed
+from sim.geometry.link_parts import BRACKETS, End, FreePose, Part, Tube, placed
 from sim.geometry.pose import Array
 from sim.geometry.rigid_body import RigidBody, joined, moved
 from sim.robot.robot_file import BASE, Base, Module, Robot, RobotFileError
@@ -35,11 +35,22 @@ _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 # HRDF's names of what a file may call otherwise here.
 _BRACKETS = {name.lower().removeprefix("x5"): name for name in BRACKETS}
 _COMMON = {"tag", "name"}
+_ENDS = {"rightangle": "RightAngle", "inline": "Inline"}
+_OURS: dict[str, End] = {"RightAngle": "right-angle", "Inline": "inline"}
+_END_EFFECTORS = {"custom": "Custom", "x5parallel": "X5Parallel"}
+# The parallel gripper: mass, centre and output as hebi-py has them. Its inertia is not published; this is
+# that of a uniform box of 60 by 60 by 90 mm on the module's face.
+_GRIPPER = FreePose(
+    mass_kg=0.2464,
+    com_xyz_m=(0.0, 0.0, 0.045),
+    inertia=(2.4e-4, 2.4e-4, 1.5e-4, 0.0, 0.0, 0.0),
+    xyz_m=(0.0, 0.0, 0.095),
+)
 # Attributes of each element; any other one would be read wrongly by being left out.
 _KNOWN = {
     "actuator": {"type"},
-    "bracket": {"type"},
-    "link": {"type", "extension", "twist", "input", "output"},
+    "bracket": {"type", "mass_offset"},
+    "link": {"type", "extension", "twist", "input", "output", "mass_offset"},
     "rigid-body": {"mass", "com_trans", "com_rot", *_INERTIA, "output_trans", "output_rot"},
     "end-effector": {"type", "mass", "com_trans", "com_rot", *_INERTIA, "output_trans", "output_rot"},
     "output": {"trans", "rot"},
@@ -122,13 +133,23 @@ class _Reader:
             part = Part(tube=self._tube(element))
         elif kind == "bracket":
             part = Part(bracket=self._word(element, "type", _BRACKETS, "x5"))
-        else:
-            if kind == "end-effector" and element.get("type", "custom").lower() != "custom":
+        elif kind == "end-effector" and self._word(element, "type", _END_EFFECTORS, "", "custom") != "Custom":
+            if own := sorted(element.attrib.keys() - {"type"} - _COMMON):
                 raise self._fail(
-                    f"an end effector of type {element.get('type')!r}; only Custom ones are known"
+                    f"<{element.tag}> has {', '.join(own)}, which only those of type Custom have"
                 )
+            part = Part(pose=_GRIPPER)
+        else:
             part = Part(pose=self._solid(element, "output_"))
-        return _Place(at.parent, (*at.parts, part))
+        return _Place(at.parent, (*at.parts, *self._more(element, part), part))
+
+    def _more(self, element: Element, part: Part) -> tuple[Part, ...]:
+        """Return what a library part weighs more here, at its centre of mass, as a part before it."""
+        mass = self._number(element, "mass_offset")
+        if not mass:
+            return ()
+        more = RigidBody(mass, placed(part).body.com_m, np.zeros((3, 3)))
+        return (Part(pose=self._posed(np.zeros(3), np.eye(3), more)),)
 
     def _actuator(self, element: Element, at: _Place) -> str:
         types: dict[str, str] = {}
@@ -144,12 +165,13 @@ class _Reader:
         return serial
 
     def _tube(self, element: Element) -> Tube:
-        for end in ("input", "output"):
-            if element.get(end, "RightAngle").lower() != "rightangle":
-                raise self._fail(f"a link's {end} is {element.get(end)!r}; only RightAngle ends are known")
         self._word(element, "type", {"x5": "X5"})
+        first, last = (self._word(element, end, _ENDS, "", "RightAngle") for end in ("input", "output"))
         length, twist = (self._number(element, name) for name in ("extension", "twist"))
-        return Tube(length_m=length, twist_rad=twist)
+        try:
+            return Tube(length_m=length, twist_rad=twist, input=_OURS[first], output=_OURS[last])
+        except ValidationError as error:
+            raise self._fail(f"<{element.tag}>: {error.errors()[0]['msg']}") from error
 
     def _solid(self, element: Element, prefix: str) -> FreePose:
         """Return a rigid body; its output is as attributes with this prefix say, none without."""
@@ -189,8 +211,10 @@ class _Reader:
             why = "; a module's mass is its type's" if kind == "actuator" else ""
             raise self._fail(f"<{element.tag}> has {', '.join(unknown)}, which is not known here{why}")
 
-    def _word(self, element: Element, name: str, known: dict[str, str], prefix: str = "") -> str:
-        word = element.get(name, "").lower()
+    def _word(
+        self, element: Element, name: str, known: dict[str, str], prefix: str = "", default: str = ""
+    ) -> str:
+        word = element.get(name, default).lower()
         found = known.get(word) or known.get(word.removeprefix(prefix))
         if found is None:
             raise self._fail(

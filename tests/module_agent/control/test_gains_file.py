@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from module_agent.control.gains import check_gains, default_gains, for_message
@@ -83,6 +84,78 @@ def test_limits_that_are_none_are_taken_by_a_module_and_stay_none(file: Path, tm
     text = (tmp_path / "out.xml").read_text()
     for name, value in (("i_clamp", "inf"), ("min_output", "-inf"), ("max_target", "inf")):
         assert text.count(f"<{name}>{value} {value}</{name}>") == len(LOOPS)
+
+
+def _arm(folder: Path) -> Path:
+    """Return the manufacturer's gains of its seven-joint arm, as its files write them: whole, and with -0."""
+    ones, none = "1 1 1 1 1 1 1", "0 0 0 0 0 0 0"
+    small = "0.25 0.25 0.25 0.25 0.25 0.25 0.25"
+    speeds = "3.434687 1.790422 3.434687 3.434687 9.617128 9.617128 9.617128"
+    torques = "25 40 25 25 4 4 4"
+    loops = {
+        "position": {
+            "kp": "50 50 25 25 5 2 2",
+            "ki": "50 50 25 25 10 5 5",
+            "i_clamp": "5 10 5 5 1 1 1",
+            "max_target": "inf inf inf inf inf inf inf",
+            "max_output": torques,
+        },
+        "velocity": {
+            "kp": "0.1 0.1 0.1 0.1 0.05 0.03 0.03",
+            "feed_forward": ones,
+            "i_clamp": small,
+            "max_target": speeds,
+            "output_lowpass": "0.75 0.5 0.5 0.5 0.75 0.75 0.75",
+        },
+        "effort": {
+            "kp": "0.2 0.3 0.3 0.3 0.25 0.25 0.25",
+            "kd": "0.0001 0.0001 0.0001 0.001 0.001 0.001 0.001",
+            "feed_forward": ones,
+            "i_clamp": small,
+            "punch": "-0 -0 -0 -0 -0 -0 -0",
+            "max_target": torques,
+            "output_lowpass": "0.5 0.5 0.5 0.5 0.9 0.9 0.9",
+            "d_on_error": none,
+        },
+    }
+    rest = dict.fromkeys(PidGains.model_fields, none) | dict.fromkeys(
+        ("max_output", "target_lowpass", "output_lowpass", "d_on_error"), ones
+    )
+    lines = ["<control_strategy>4 4 4 4 4 4 4</control_strategy>"]
+    for loop, own in loops.items():
+        values = rest | own
+        for side in ("target", "output"):
+            values[f"min_{side}"] = " ".join(f"-{limit}" for limit in values[f"max_{side}"].split())
+        lines += [f"<{loop}>", *(f"<{name}>{text}</{name}>" for name, text in values.items()), f"</{loop}>"]
+    text = (
+        "\n   ".join(('<?xml version="1.0" encoding="utf-8"?>\n<group_gains>', *lines)) + "\n</group_gains>\n"
+    )
+    path = folder / "arm.xml"
+    path.write_text(text)
+    return path
+
+
+def test_the_gains_of_an_arm_of_the_manufacturers_keep_their_meaning(tmp_path: Path) -> None:
+    path = _arm(tmp_path)
+    gains = read_gains(path, [default_gains(module_type("X5-1"), 0)] * 7)
+    for own in gains:
+        check_gains(own)
+    assert [own.position.ki for own in gains] == [50.0, 50.0, 25.0, 25.0, 10.0, 5.0, 5.0]
+    write_gains(tmp_path / "out.xml", gains)
+    assert read_gains(tmp_path / "out.xml", gains[::-1]) == gains
+    try:
+        hebi = hebi_library.library()
+    except UsageError:
+        pytest.skip("hebi-py is not installed")
+    theirs, ours = hebi.GroupCommand(7), hebi.GroupCommand(7)
+    theirs.read_gains(str(path))
+    ours.read_gains(str(tmp_path / "out.xml"))
+    np.testing.assert_array_equal(ours.control_strategy, theirs.control_strategy)
+    for loop in LOOPS:
+        for name in PidGains.model_fields:
+            before, after = (getattr(command, f"{loop}_{name}") for command in (theirs, ours))
+            assert not np.isnan(before).any()
+            np.testing.assert_array_equal(after, before, f"{loop}.{name}")
 
 
 def test_a_gain_that_is_no_limit_cannot_be_infinite(file: Path) -> None:

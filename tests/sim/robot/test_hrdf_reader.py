@@ -78,17 +78,22 @@ def test_branches_share_what_carries_them_and_its_mass_counts_once(tmp_path: Pat
 
 
 def compared(hebi: Any, path: Path, robot: Any, ends: int) -> None:
-    """Compare the displacement of every end from its place at q = 0 with hebi-py's, over random positions."""
+    """Compare the displacement of every end from its place at q = 0 with hebi-py's, over random positions.
+
+    A chain without an end effector, `ends` of 0, ends at its last output.
+    """
     model = hebi.robot_model.import_from_hrdf(str(path))
     chain = true_chain(robot)
     rng = np.random.default_rng(3)
     base = np.asarray(model.base_frame)
 
     def theirs(q: Any) -> Any:
-        return [np.asarray(f) for f in model.get_forward_kinematics("endeffector", q)]
+        if ends:
+            return [np.asarray(f) for f in model.get_forward_kinematics("endeffector", q)]
+        return [np.asarray(model.get_forward_kinematics("output", q)[-1])]
 
     rest = theirs(np.zeros(len(robot.serials)))
-    assert len(rest) == ends
+    assert len(rest) == max(ends, 1)
     up = base[:3, :3] @ (chain.gravity / np.linalg.norm(chain.gravity))
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=F4)
     leaves = [k for k in range(len(robot.serials)) if k not in robot.parents]
@@ -100,13 +105,44 @@ def compared(hebi: Any, path: Path, robot: Any, ends: int) -> None:
             np.testing.assert_allclose(now @ np.linalg.inv(home), expected, atol=F4)
 
 
+# The manufacturer's four-joint kit and its SCARA arm with a gripper, in the forms in which its files have
+# them: no version or names, pi in decimals, and mass that is mounted on a tube.
+ARM_KIT = """<robot>
+  <actuator type="X5-4"/><bracket type="X5HeavyRightOutside"/>
+  <actuator type="X5-9"/><link type="X5" extension="0.325" twist="3.14159265358979323846264338327950288"/>
+  <actuator type="X5-4"/><link type="X5" extension="0.325" twist="3.14159265358979323846264338327950288"/>
+  <actuator type="X5-1"/>
+</robot>"""
+SCARA = """<?xml version="1.0" encoding="UTF-8"?>
+<robot version="1.2.0">
+  <actuator type="X5-4"/><bracket type="X5HeavyRightOutside"/>
+  <actuator type="X5-9"/><link type="X5" extension="0.325" twist="-pi/2" mass_offset="0.5"/>
+  <actuator type="X5-4"/><link type="X5" extension="0.325" twist="pi"/>
+  <actuator type="X5-1"/><end-effector type="X5Parallel"/>
+</robot>"""
+INLINE = """<robot version="1.6.0">
+  <actuator type="X5-9"/><link type="X5" input="Inline" extension="0.325" twist="-pi/3"/>
+  <actuator type="X5-4"/><link type="X5" output="Inline" extension="0.2" twist="pi/2"/>
+  <actuator type="X5-4"/><link type="X5" input="Inline" output="Inline" extension="0.15" twist="1"/>
+  <actuator type="X5-1"/><end-effector type="X5Parallel"/>
+</robot>"""
+
+
 WITH_ENDS = TREE.replace(
     '<actuator type="X5-1" tag="right"/>', '<actuator type="X5-1" tag="right"/><end-effector type="Custom"/>'
 )
 
 
 @pytest.mark.parametrize(
-    ("text", "ends"), [(KIT.replace("</robot>", '<end-effector type="Custom"/></robot>'), 1), (WITH_ENDS, 2)]
+    ("text", "ends"),
+    [
+        (KIT.replace("</robot>", '<end-effector type="Custom"/></robot>'), 1),
+        (WITH_ENDS, 2),
+        (ARM_KIT, 0),
+        (SCARA, 1),
+        (INLINE, 1),
+    ],
+    ids=["kit", "tree", "arm kit", "SCARA", "inline"],
 )
 def test_hebi_py_moves_it_as_we_do_before_and_after_our_writer(tmp_path: Path, text: str, ends: int) -> None:
     try:
@@ -134,12 +170,21 @@ def test_hebi_py_moves_it_as_we_do_before_and_after_our_writer(tmp_path: Path, t
         ("<robot><joint axis='rz'/></robot>", "<joint> is not known"),
         ("<robot><link type='X5' extension='1+' twist='0'/></robot>", "extension '1+' is no number"),
         ("<robot><link type='X5' extension='__import__(1)' twist='0'/></robot>", "is no number or formula"),
-        ("<robot><link type='X5' extension='.3' twist='0' output='Inline'/></robot>", "only RightAngle"),
+        (
+            "<robot><link type='X5' extension='.3' twist='0' output='Up'/></robot>",
+            "known are RightAngle, Inline",
+        ),
+        (
+            "<robot><link type='X5' extension='-1' twist='0'/></robot>",
+            "<link>: Input should be greater than 0",
+        ),
+        ("<robot><bracket type='X5LightLeft' mass_offset='-0.1'/></robot>", "greater than or equal to 0"),
+        ("<robot><end-effector type='X5Parallel' mass='1'/></robot>", "which only those of type Custom have"),
         ("<robot><bracket type='X9'/></robot>", "<bracket> of type 'X9'; known are X5LightRight"),
         ("<robot><rigid-body mass='1' output_rot='1 0 0'/></robot>", "is no rotation"),
         ("<robot><rigid-body mass='1' output_trans='1 0'/></robot>", "has 2 numbers, not 3"),
         ("<robot><rigid-body mass='-1'/></robot>", "greater than or equal to 0"),
-        ("<robot><end-effector type='X5Parallel'/></robot>", "only Custom ones"),
+        ("<robot><end-effector type='R8Parallel'/></robot>", "known are Custom, X5Parallel"),
         ("<robot/>", "at least 1 item"),
         ("<urdf/>", "its root is <urdf>"),
         ("<robot>", "no HRDF can be read"),
