@@ -45,12 +45,12 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
         TopologyError: the observations contradict each other or leave open how a module is mounted.
     """
     observed = _observed_motions(recording, serials)
-    if not observed.observations:
+    observations, unmoved = _usable(observed)
+    if not observations:
         reasons = "; ".join(f"joint {serial}: {why}" for serial, why in observed.unmoved.items())
         raise TopologyError(
             f"no module observed any motion: the topology cannot be identified. {reasons}", tuple(serials)
         )
-    observations, unmoved = _usable(observed)
     topology = find_topology(observations, unmoved)
     excluded = exclusion_notes(recording.journal)
     return TopologyFound(topology, observations, (*excluded, *_notes(observed, topology)))

@@ -156,9 +156,12 @@ def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -
     """Derive the likeliest tree, however likely it is; `find_topology` is what to believe.
 
     Raises:
-        TopologyError: a module has no observations, or its joint has none and it is not `unmoved`.
+        TopologyError: a module has no observations, or its joint has none and it is not `unmoved`; or there
+            are none at all.
     """
     serials = sorted({serial for pair in observations for serial in pair} | set(unmoved))
+    if not serials:
+        raise TopologyError("no module observed any motion: the topology cannot be identified", ())
     _check_complete(serials, observations, unmoved)
     # (n, n) log-odds that joint i carries the IMU of module k, 0 for what was not seen.
     seen = [[observations.get((joint, observer)) for observer in serials] for joint in serials]

@@ -1,5 +1,6 @@
 """Outcomes of seeds: one for each, and the table of faults against outcomes."""
 
+import traceback
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,7 +73,10 @@ def _judged(schedule: Schedule) -> SeedReport:
             violations["agent died"] = str(error)
         except Exception as error:
             ending = Ending(type(error).__name__, str(error))
-            violations["traceback"] = f"{type(error).__name__}: {error}"
+            last = traceback.extract_tb(error.__traceback__)
+            ours = [frame for frame in last if "site-packages" not in frame.filename] or last
+            at = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
+            violations["traceback"] = f"{type(error).__name__} at {at}: {error}"
         violations |= witness.violations | check_folder(Path(folder) / "run", ending)
     outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
     serials = schedule.robot.serials

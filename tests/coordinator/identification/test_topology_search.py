@@ -106,6 +106,13 @@ def test_without_any_moved_joint_the_error_says_so(wire: SimpleNamespace) -> Non
         search_topology(recorded(wire, stuck=SERIALS), SERIALS)
 
 
+def test_without_any_heard_module_no_motion_is_repeated(wire: SimpleNamespace) -> None:
+    recording = recorded(wire, silent_from=dict.fromkeys(SERIALS, 150))
+    assert doubtful_motions(recording) == ()
+    with pytest.raises(TopologyError, match="no module observed any motion"):
+        search_topology(recording, SERIALS)
+
+
 def test_a_module_that_falls_silent_before_all_motions_is_excluded(wire: SimpleNamespace) -> None:
     result = search_topology(recorded(wire, silent_from={"C": 150}), SERIALS)
     assert (result.topology.serials, result.topology.parent) == (("A", "B"), (-1, 0))

@@ -257,3 +257,9 @@ def test_a_housing_that_turns_the_wrong_way_about_its_own_axis_is_named() -> Non
     seen["B", "B"] = MotionObservation(True, 1.0, -MINUS_Z)
     with pytest.raises(TopologyError, match="encoder's sign"):
         find_topology(seen)
+
+
+def test_without_any_observation_there_is_no_tree() -> None:
+    for find in (likely_topology, find_topology):
+        with pytest.raises(TopologyError, match="no module observed any motion"):
+            find({})
