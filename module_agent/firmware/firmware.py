@@ -273,7 +273,10 @@ class Firmware:
     def _enter(self, trigger: Trigger, note: str = "") -> None:
         target = TRANSITIONS[self.state].get(trigger)
         if target is None:
-            raise WireError(Refusal.NOT_ARMED, f"{trigger} is not possible while {self.state}: acquire first")
+            why = f" ({self._note})" if self.state == "fault" else ""
+            raise WireError(
+                Refusal.NOT_ARMED, f"{trigger} is not possible while {self.state}{why}: acquire first"
+            )
         self.state = target
         self._status_due_ns = 0
         self._note = note

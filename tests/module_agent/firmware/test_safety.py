@@ -123,6 +123,15 @@ def test_a_motor_off_at_its_limit_stays_off_until_the_joint_is_back_and_acquired
     assert one.firmware.state == "armed"
 
 
+def test_a_refusal_without_a_fault_gives_no_reason_in_brackets() -> None:
+    one = bench()
+    one.acquire()
+    one.setpoint(0.1)
+    answer = one.move(7, Rest(duration_s=1.0))
+    assert refused(answer, Refusal.NOT_ARMED)
+    assert answer.detail == "motion is not possible while streaming: acquire first"
+
+
 # ------------------------------------------------------------------ winding
 
 
@@ -135,6 +144,9 @@ def test_a_winding_limit_is_a_fault_and_must_cool_by_14_k() -> None:
     one.winding_c = 90.0
     one.tick()
     assert (one.firmware.state, one.pwm) == ("fault", 0.0)
+    answer = one.move(7, Rest(duration_s=1.0))
+    assert refused(answer, Refusal.NOT_ARMED)
+    assert answer.detail == "motion is not possible while fault (winding at 90 C): acquire first"
     one.winding_c = 76.1
     answer = one.acquire()
     assert refused(answer, Refusal.NOT_ARMED)
