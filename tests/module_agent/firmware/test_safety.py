@@ -126,10 +126,10 @@ def test_a_motor_off_at_its_limit_stays_off_until_the_joint_is_back_and_acquired
 def test_a_refusal_without_a_fault_gives_no_reason_in_brackets() -> None:
     one = bench()
     one.acquire()
-    one.setpoint(0.1)
+    one.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="anybody", why="test"))
     answer = one.move(7, Rest(duration_s=1.0))
     assert refused(answer, Refusal.NOT_ARMED)
-    assert answer.detail == "motion is not possible while streaming: acquire first"
+    assert answer.detail == "motion is not possible while stopped: acquire first"
 
 
 # ------------------------------------------------------------------ winding
