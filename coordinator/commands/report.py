@@ -10,6 +10,7 @@ from coordinator.report.pages import SUFFIXES, check_suffix, write_page
 from coordinator.report.plots import check_plots
 from coordinator.report.run_report import read_run, run_report
 from coordinator.runtime.command_line import in_a_folder
+from coordinator.runtime.terminal import Terminal
 
 
 def report(
@@ -26,5 +27,9 @@ def report(
     path = in_a_folder(check_suffix(out if out is not None else folder / REPORT))
     check_plots()
     assert path is not None
-    write_page(path, run_report(read_run(folder)))
+    with Terminal() as terminal:
+        terminal.step(1, 2, f"reading {folder}")
+        data = read_run(folder)
+        terminal.step(2, 2, "drawing the report")
+        write_page(path, run_report(data))
     typer.echo(f"written to {path}")

@@ -112,22 +112,27 @@ def replay(
     if not session.is_file():
         raise UsageError(f"{session}: there is no such recording")
     folder = out if out is not None else session.parent
-    recording, terminal = load_recording(session), Terminal()
-    # Before anything is identified: where that fails this may be why.
-    for sentence in (*recording.damage, *recording.remarks):
-        terminal.note(sentence)
-    before = baseline_within(session.parent)
-    revise = before.updated if before is not None else None
-    identified = identify(recording, revise=revise, measured=measured_before_run(session.parent, before))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_outputs(folder, identified)
+    steps = 3 if report else 2
+    with Terminal() as terminal:
+        terminal.step(1, steps, f"reading {session}")
+        recording = load_recording(session)
+        # Before anything is identified: where that fails this may be why.
+        for sentence in (*recording.damage, *recording.remarks):
+            terminal.note(sentence)
+        terminal.step(2, steps, "identifying the robot")
+        before = baseline_within(session.parent)
+        revise = before.updated if before is not None else None
+        identified = identify(recording, revise=revise, measured=measured_before_run(session.parent, before))
+        folder.mkdir(parents=True, exist_ok=True)
+        write_outputs(folder, identified)
+        if report:
+            terminal.step(3, steps, "writing the report")
+            try:
+                write_report(folder, recording, identified.result)
+            except MissingPlots as error:
+                terminal.note(f"no report: {error}")
     print_result(identified.result, terminal)
     write_result(json_file, identified.result)
-    if report:
-        try:
-            write_report(folder, recording, identified.result)
-        except MissingPlots as error:
-            terminal.note(f"no report: {error}")
     terminal.console.print(f"written to {folder}{report_at(folder)}", markup=False, soft_wrap=True)
     end_if_suspect(identified.result.suspicions)
 

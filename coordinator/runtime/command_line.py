@@ -230,6 +230,10 @@ def _rank(called: Any, option: str) -> int:
 
 
 def _loaded(name: str, place: str) -> Any:
+    # Threads of BLAS gain nothing on matrices of a robot's size, and on busy cores they wait for each other.
+    # The library reads this as it is loaded; processes that a command starts inherit it.
+    for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(threads, "1")
     module, _, function = place.rpartition(".")
     loaded = getattr(import_module(module), function)
     if not isinstance(loaded, typer.Typer):

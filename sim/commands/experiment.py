@@ -49,9 +49,6 @@ def experiment(kept: str = "nothing is written") -> Iterator[Terminal]:
 
     `kept` says what remains then.
     """
-    # Processes that share the cores already must not each start as many threads; they inherit this.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)
     try:

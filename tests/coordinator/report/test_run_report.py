@@ -266,6 +266,8 @@ def test_without_matplotlib_runs_and_replays_end_as_they_would_and_say_so(
     assert any("no report: a report needs matplotlib" in line for line in lines)
     done = CliRunner().invoke(app, ["replay", str(folder / SESSION), "--out", str(tmp_path / "again")])
     assert done.exit_code == 0, done.output
+    steps = [line for line in done.output.splitlines() if line.startswith("[")]
+    assert [line[:5] for line in steps] == ["[1/3]", "[2/3]", "[3/3]"]
     assert "x5-self-model[report]" in done.output
     assert (tmp_path / "again" / RESULT).read_bytes() == (folder / RESULT).read_bytes()
     assert not (tmp_path / "again" / REPORT).exists()

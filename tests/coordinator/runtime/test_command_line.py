@@ -299,3 +299,20 @@ def test_codes_of_ending_are_in_the_help_and_in_one_table_of_the_guide() -> None
         value for name, value in vars(errors).items() if name.startswith("EXIT_") and name != "EXIT_CODES"
     }
     assert constants <= EXIT_CODES.keys()
+
+
+@pytest.mark.parametrize("given", [None, "3"])
+def test_linear_algebra_of_a_command_uses_one_thread_unless_the_user_says_otherwise(given: str | None) -> None:
+    program = (
+        "import os, sys; from coordinator.main import app; from typer.testing import CliRunner\n"
+        "assert 'numpy' not in sys.modules\n"
+        "assert CliRunner().invoke(app, ['replay', '--help']).exit_code == 0\n"
+        "assert 'numpy' in sys.modules\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'], os.environ['OMP_NUM_THREADS'])"
+    )
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment |= {} if given is None else dict.fromkeys(names, given)
+    command = [sys.executable, "-c", program]
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    assert said.split() == [given or "1"] * 2
