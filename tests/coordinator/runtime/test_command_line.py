@@ -302,7 +302,9 @@ def test_codes_of_ending_are_in_the_help_and_in_one_table_of_the_guide() -> None
 
 
 @pytest.mark.parametrize("given", [None, "3"])
-def test_linear_algebra_of_a_command_uses_one_thread_unless_the_user_says_otherwise(given: str | None) -> None:
+def test_linear_algebra_of_a_command_uses_one_thread_unless_the_user_says_otherwise(
+    given: str | None,
+) -> None:
     program = (
         "import os, sys; from coordinator.main import app; from typer.testing import CliRunner\n"
         "assert 'numpy' not in sys.modules\n"
