@@ -99,7 +99,7 @@ def _left(contents: Contents) -> rrb.Vertical:
             entity_paths.POSITION,
             contents.position_rad,
         ),
-        row_shares=[1.2, 6, 4],
+        row_shares=[1.6, 6, 4],
     )
 
 
