@@ -113,7 +113,9 @@ class ModuleGroup:
         """Return a module's own description: type, limits, gains."""
         info = self.module(serial).info
         if info is None:
-            raise NoAnswer(serial, Leaf.INFO, "it has not told its type")
+            again = any(record.info for (each, _), record in self._recording.past.items() if each == serial)
+            since = " since it booted anew, or a second module has its serial" if again else ""
+            raise NoAnswer(serial, Leaf.INFO, f"it has not told its type{since}")
         return info
 
     async def meet(self, serials: Sequence[str]) -> None:
@@ -425,7 +427,7 @@ class ModuleGroup:
         return status.motion.origin_rad if status is not None and status.motion is not None else 0.0
 
     def _ended(self, serial: str, number: int) -> bool:
-        status = self.module(serial).status
+        status = self._status_under_lease(serial)
         if status is None:
             return False
         motion = status.motion

@@ -59,6 +59,41 @@ def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Cal
     assert [rig.state(s) for s in rig.serials] == ["idle", "idle"]
 
 
+def test_an_expiry_before_the_lease_does_not_end_the_first_motion_under_it(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, recording, group = rig.group()
+
+    async def work() -> None:
+        keeper = await _armed(group)
+        for target in (0.1, 0.0, 0.1, 0.0):
+            module = recording.modules[TIP]
+            assert module.status is not None
+            # The newest that has arrived when the motion begins: the answer of the lease was lost, or is late.
+            module.status = module.status.model_copy(update={"state": "expired", "motion": None, "t_ns": 1})
+            done = await group.run({TIP: GoTo(target_rad=target, max_speed_rad_s=0.8)})
+            assert done[TIP].outcome == "done"
+        keeper.cancel()
+        await group.release_all()
+
+    rig.run(work())
+
+
+def test_a_module_that_booted_anew_or_twice_and_tells_no_type_is_described_as_such(
+    rigs: Callable[..., Any],
+) -> None:
+    rig = rigs(ARM, "none")
+    _, recording, group = rig.group()
+
+    async def work() -> None:
+        await _met(group)
+
+    rig.run(work())
+    assert group.info(BASE).serial == BASE
+    recording.module(BASE, recording.modules[BASE].boot + 1)
+    with pytest.raises(NoAnswer, match="not told its type since it booted anew, or a second module has its"):
+        group.info(BASE)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
     rigs: Callable[..., Any], seed: int
