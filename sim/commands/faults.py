@@ -19,6 +19,7 @@ from sim.commands.options import load
 from sim.faults.fault import Fault, fault_of
 from sim.faults.report import OUTCOMES, SeedReport, by_fault, run_seed
 from sim.faults.schedule import Schedule, draw, first_modules
+from sim.physics.engine import Physics
 from sim.thesis.experiment import Unit
 from sim.thesis.study import Store, key
 
@@ -41,6 +42,7 @@ def faults(
     fault: Annotated[
         list[str] | None, typer.Option(help="A fault, as a report prints it; repeat for more [drawn].")
     ] = None,
+    physics: Annotated[Physics, typer.Option(help="What moves the bodies.")] = "compiled",
     shrink: Annotated[bool, typer.Option(help="Make what violates an invariant simpler.")] = True,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
@@ -59,7 +61,9 @@ def faults(
     Exit code 0 if no invariant is violated, 4 if one is, 2 for wrong usage, 130 if interrupted.
     """
     numbers = seed_range(seeds)
-    schedules = [_schedule(seed, robot, modules, network, fault) for seed in numbers]
+    schedules = [
+        _schedule(seed, robot, modules, network, fault)._replace(physics=physics) for seed in numbers
+    ]
     units = [
         Unit(f"seed {one.seed}", run_seed, (one, shrink), kind=SeedReport, cost_s=COST_S) for one in schedules
     ]

@@ -12,6 +12,7 @@ from sim.faults.fault import KINDS
 from sim.faults.invariants import check_folder, is_misnamed
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import Schedule, simpler
+from sim.physics.engine import Physics
 
 Outcome = Literal["right", "suspect", "named", "misnamed", "stopped", "violation"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
@@ -23,7 +24,7 @@ MAX_SHRINKING = 20
 class SeedReport(NamedTuple):
     """What became of a seed.
 
-    modules, network, faults: the session, so that it can be run again. kinds: of its faults.
+    modules, network, faults, physics: the session, so that it can be run again. kinds: of its faults.
     outcome: the right robot with exit code 0, a result called suspect, an error that names what
     may have happened, one that accuses a healthy module, stopped with its coordinator killed, or a violation
     of an invariant.
@@ -43,13 +44,15 @@ class SeedReport(NamedTuple):
     violations: dict[str, str]
     named_rightly: bool | None = None
     simplest: "SeedReport | None" = None
+    physics: Physics = "compiled"
 
     def options(self, robot: str | None = None) -> str:
         """Return the options of `x5-sim faults` that repeat it; `robot` is the robot as the user gave it."""
         faults = "".join(f' --fault "{fault}"' for fault in self.faults)
+        engine = "" if self.physics == "compiled" else f" --physics {self.physics}"
         return (
             f"--seeds {self.seed}..{self.seed} --robot {robot or self.robot} --modules {self.modules} "
-            f"--network {self.network}{faults}"
+            f"--network {self.network}{engine}{faults}"
         )
 
 
@@ -93,6 +96,7 @@ def _judged(schedule: Schedule) -> SeedReport:
         text=ending.text,
         outcome="violation" if violations else outcome,
         violations=violations,
+        physics=schedule.physics,
         named_rightly=named if outcome in ("named", "misnamed", "suspect") and not violations else None,
     )
 

@@ -94,7 +94,14 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
             each(now_ns, endpoint, kind, key, payload)
 
     safety = {s: Safety(position_rad=range_rad) for s, range_rad in position_ranges(schedule).items()}
-    settings = VirtualSettings(schedule.robot, network(schedule.network), schedule.seed, "x5", safety=safety)
+    settings = VirtualSettings(
+        schedule.robot,
+        network(schedule.network),
+        schedule.seed,
+        "x5",
+        physics=schedule.physics,
+        safety=safety,
+    )
     robot = FaultyRobot(settings, loop, VirtualNetwork(loop, tap), schedule.faults)
     session = _Session(schedule, robot, out, taps)
     robot.on_run.append(partial(witness.check, robot))

@@ -13,6 +13,7 @@ import numpy as np
 
 from module_agent.model.errors import UsageError
 from sim.faults.fault import KINDS, NATURES, Fault
+from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot, load_robot
 
 # Shipped robots, and how many of their modules: two to four joints, and a tree.
@@ -34,12 +35,13 @@ ROOM_RAD = (0.8, 1.4)
 
 
 class Schedule(NamedTuple):
-    """One session: the robot, its network profile by name, and faults in the order of their time."""
+    """One session: robot, network profile by name, faults in the order of their time, the world's engine."""
 
     seed: int
     robot: Robot
     network: str
     faults: tuple[Fault, ...]
+    physics: Physics = "compiled"
 
 
 def draw(seed: int, robot: Robot | None = None) -> Schedule:
