@@ -3,10 +3,12 @@
 Base motion and link compliance are estimated in turn; each needs an approximate chain.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from coordinator.batch_estimation.encoder_scale import with_encoder_scales
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
@@ -41,7 +43,9 @@ MAX_IMU_SAMPLES = 40_000
 # All steps but the last use a quarter of them.
 COARSE = 4
 # Errors in standard deviations: from the first on the catalogue is doubted, from the second on it is wrong.
-SUSPICIOUS, SIGNIFICANT = 3.0, 4.0
+# In a larger robot more healthy IMUs' errors are that large by chance: the first grows, so that at most the
+# third share of healthy robots is doubted.
+SUSPICIOUS, SIGNIFICANT, DOUBTED_SHARE = 3.0, 4.0, 0.2
 # By how much base motion must reduce the mean log residual. On rigid bases the difference is up to 0.0015 of
 # either sign, and the IMU's noise as base motion biases accelerometers by two sigma; compliant bases make 2.
 MIN_SHAKING = 0.005
@@ -88,7 +92,7 @@ def refine_checked(
     suspects = Suspects((), tuple(doubted), np.zeros(count))
     fitted = _fitted(chain, kinds, windows, prior, floor, known, suspects, noise)
     refined = fitted.refined
-    if count == 1 or _outlier(refined, prior, known) < SUSPICIOUS:
+    if count == 1 or _outlier(refined, prior, known) < suspicious_beyond(count, prior):
         return refined, suspects
     everyone = tuple(range(count))
     freed = Suspects(everyone, everyone, suspects.scale)
@@ -111,6 +115,17 @@ def refine_checked(
         return refined, suspects
     suspects = Suspects(imus, encoders, np.where(off, free.encoder_scale, 0.0))
     return refine_robot(free.chain, kinds, windows, prior, floor, known, suspects, noise), suspects
+
+
+def suspicious_beyond(count: int, prior: ImuPrior) -> float:
+    """Return how large the largest error of `count` modules' sensors must be to doubt the catalogue [sigma].
+
+    Sidak's correction for as many normal deviates as are estimated of the IMUs (Sidak 1967, J. Am. Stat.
+    Assoc. 62, 626).
+    """
+    errors = count * int(np.count_nonzero(prior.sigmas))
+    alone = -math.expm1(math.log1p(-DOUBTED_SHARE) / errors) if errors else 1.0
+    return max(SUSPICIOUS, float(-ndtri(0.5 * alone)))
 
 
 def _outlier(refined: Refinement, prior: ImuPrior, known: ImuCalibration) -> float:

@@ -68,7 +68,7 @@ def test_an_expiry_before_the_lease_does_not_end_the_first_motion_under_it(rigs:
         for target in (0.1, 0.0, 0.1, 0.0):
             module = recording.modules[TIP]
             assert module.status is not None
-            # The newest that has arrived when the motion begins: the answer of the lease was lost, or is late.
+            # What has arrived when the motion begins: the answer to the lease was lost, or is late.
             module.status = module.status.model_copy(update={"state": "expired", "motion": None, "t_ns": 1})
             done = await group.run({TIP: GoTo(target_rad=target, max_speed_rad_s=0.8)})
             assert done[TIP].outcome == "done"
