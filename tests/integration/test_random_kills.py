@@ -101,7 +101,8 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
             for agent in agents:
                 code, words = programs.ended(agent)
                 assert code == EXIT_LOST, words
-                assert "the modules are gone" in words
+                # On a busy machine the world may be killed before an agent has found it.
+                assert "the modules are gone" in words or "no world listens on" in words
             left = set()
         else:
             # Modules outlive their coordinator and one another: motors off, they wait for the next one.
