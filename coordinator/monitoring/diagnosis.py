@@ -15,22 +15,22 @@ from scipy.special import chdtri
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.contact import Contact
 from coordinator.monitoring.findings import Detection
-from coordinator.monitoring.likelihood_ratio import Change, WhitenedRows, joined, without_own
+from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, without_own
 from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
     UNIT_PAYLOAD_KG,
     ImuModel,
     displacement,
+    drive_evidence,
     drive_window,
-    imu_rows,
+    imu_evidence,
     information_of,
-    torque_rows,
-    whitened_drive_rows,
+    torque_evidence,
 )
 from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.payload import find_payload
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
-from module_agent.model.chain import Array
+from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import places_on_axes
 from module_agent.model.information import JointInformation, merge
 from module_agent.model.regressor import PER_BODY
@@ -59,15 +59,21 @@ class SegmentInformation:
     start_ns: int
     end_ns: int
     moved: bool
-    information: tuple[JointInformation, ...]
-    drives: tuple[WhitenedRows | None, ...]
+    torque: Evidence
+    drives: tuple[Evidence | None, ...]
+    chain: Chain
     imu_model: ImuModel
     segment: DataSegment
 
     @cached_property
-    def imu(self) -> WhitenedRows:
+    def imu(self) -> Evidence:
         """The evidence of the IMUs, own parameters first; a robot at rest is not asked for it."""
-        return imu_rows(self.imu_model, self.segment)
+        return imu_evidence(self.imu_model, self.segment)
+
+    @cached_property
+    def information(self) -> tuple[JointInformation, ...]:
+        """What a payload is weighed by."""
+        return information_of(self.chain, self.segment)
 
 
 class LoadShift(NamedTuple):
@@ -91,14 +97,15 @@ class Diagnosis(NamedTuple):
 def segment_information(reference: Reference, segment: DataSegment) -> SegmentInformation:
     """Return what a stretch says."""
     drives = tuple(
-        whitened_drive_rows(model, segment, joint) for joint, model in enumerate(reference.drive_models)
+        drive_evidence(model, segment, joint) for joint, model in enumerate(reference.drive_models)
     )
     return SegmentInformation(
         int(segment.t_ns[0]),
         int(segment.t_ns[-1]),
         bool((np.abs(segment.qd_rad_s) > MOVING_RAD_S).any()),
-        information_of(reference.chain, segment),
+        torque_evidence(reference.chain, reference.phi, reference.torque_sigma_nm, segment),
         drives,
+        reference.chain,
         reference.imu_model,
         segment,
     )
@@ -130,7 +137,7 @@ def _drives(
         parts = [rows for segment in window if (rows := segment.drives[joint]) is not None]
         if known is None or not parts:
             continue
-        change = known.test(drive_window(parts)).changes[0]
+        change = known.find(drive_window(parts))[0]
         scaled = model.relative_friction
         sigma, more = float(np.sqrt(scaled @ change.covariance @ scaled)), float(scaled @ change.size)
         if change.gain > thresholds.drive and abs(more) > MIN_FRICTION + 3.0 * sigma:
@@ -155,8 +162,9 @@ def _link(
     if not chain.linked or 2 * sum(segment.moved for segment in window) < len(window):
         return None
     later = without_own(joined([segment.imu for segment in window]), reference.imu_model.own_sigma)
-    found = reference.imu.test(later)
-    best, child = found.changes[found.best], chain.linked[found.best]
+    found = reference.imu.find(later)
+    most = _most(found)
+    best, child = found[most], chain.linked[most]
     if best.gain < thresholds.link:
         return None
     turn, shift = displacement(chain, child, best.size)
@@ -177,12 +185,19 @@ def _link(
 def _load(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation]
 ) -> LoadShift | None:
-    found = reference.torque.test(torque_rows(_merged(window), reference.phi, reference.torque_sigma_nm))
-    best: Change = found.changes[found.best]
+    later = joined([segment.torque for segment in window])
+    found = reference.torque.find(later)
+    carrier = _most(found)
+    best = found[carrier]
     if best.gain < thresholds.payload:
         return None
     change = UNIT_PAYLOAD_KG * parameter_scale(1) * best.size
-    return LoadShift(found.best, best.gain, found.misfit - best.gain, change)
+    return LoadShift(carrier, best.gain, reference.torque.misfit(later) - best.gain, change)
+
+
+def _most(changes: Sequence[Change]) -> int:
+    """Return which hypothesis explains most."""
+    return int(np.argmax([change.gain for change in changes]))
 
 
 def explains(reference: Reference, load: LoadShift) -> bool:

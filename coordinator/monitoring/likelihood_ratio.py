@@ -1,4 +1,4 @@
-"""Did parameters change? A generalised likelihood ratio on square-root information.
+"""Did parameters change? A generalised likelihood ratio in information form.
 
 Linear models with unknown parameters theta that are the same before and later, but for a change C x:
 
@@ -7,8 +7,20 @@ Linear models with unknown parameters theta that are the same before and later, 
 
 By how much x makes the misfit smaller is twice the logarithm of the likelihood ratio, chi-square distributed
 with as many degrees of freedom as x has if nothing has changed (Kay, Fundamentals of Statistical Signal
-Processing II, section 6.5). theta is eliminated by a QR with a wide prior of its own, so that what neither
-stretch tells says nothing.
+Processing II, section 6.5).
+
+Of rows A with targets a only the information matrix A^T A and the information vector A^T a are kept: those of
+several stretches add (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation, section 3.4), so that a window that slides costs sums. That squares the condition number, but
+theta has a prior, in whose standard deviations sigma it is scaled here: no eigenvalue of
+
+    M = 1 + B^T B + L^T L
+
+is below one, and those of a run of minutes are below 1e10, which leaves six digits of what is known least.
+With h = B^T b + L^T l the change of one hypothesis has, theta eliminated (Schur complement),
+
+    S = 1 + C^T (L^T L - L^T L M^-1 L^T L) C,   r = C^T (L^T l - L^T L M^-1 h),
+    x = S^-1 r,   gain = r^T S^-1 r.
 """
 
 from collections.abc import Sequence
@@ -16,23 +28,26 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import qr
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri
 
 from module_agent.model.chain import Array
-from module_agent.model.read_only import make_read_only, read_only
+from module_agent.model.read_only import make_read_only
 
 
-class WhitenedRows(NamedTuple):
-    """Rows (k, p) and targets (k,) of a stretch of time, in standard deviations, read-only."""
+class Evidence(NamedTuple):
+    """What a stretch of time says of p parameters, read-only.
 
-    rows: Array
-    target: Array
+    matrix: (p, p) A^T A, vector: (p,) A^T a, of rows A and targets a in standard deviations of their noise.
+    """
+
+    matrix: Array
+    vector: Array
 
     @property
     def parameters(self) -> int:
         """How many parameters it is about."""
-        return int(self.rows.shape[1])
+        return int(self.vector.size)
 
 
 class Change(NamedTuple):
@@ -47,20 +62,8 @@ class Change(NamedTuple):
     covariance: Array
 
 
-class ChangeTest(NamedTuple):
-    """The best change of every hypothesis; misfit: what there is to explain, in variances."""
-
-    misfit: float
-    changes: tuple[Change, ...]
-
-    @property
-    def best(self) -> int:
-        """The index of the hypothesis that explains most."""
-        return int(np.argmax([change.gain for change in self.changes]))
-
-
-def compressed(rows: ArrayLike, target: ArrayLike) -> WhitenedRows:
-    """Return evidence that says the same of the parameters in at most p rows.
+def evidence_of(rows: ArrayLike, target: ArrayLike) -> Evidence:
+    """Return what rows (k, p) and targets (k,) in standard deviations say of the parameters.
 
     What no parameters explain of the targets is left out: it is noise, whatever has changed.
 
@@ -72,10 +75,10 @@ def compressed(rows: ArrayLike, target: ArrayLike) -> WhitenedRows:
         raise ValueError(f"rows {matrix.shape} and targets {vector.shape} do not fit: (k, p) and (k,)")
     if not (np.isfinite(matrix).all() and np.isfinite(vector).all()):
         raise ValueError("a row or a target is not finite")
-    return _triangular(matrix, vector, 0)
+    return _read_only(matrix.T @ matrix, matrix.T @ vector)
 
 
-def joined(parts: Sequence[WhitenedRows]) -> WhitenedRows:
+def joined(parts: Sequence[Evidence]) -> Evidence:
     """Return the evidence of several stretches of time together.
 
     Raises:
@@ -83,22 +86,30 @@ def joined(parts: Sequence[WhitenedRows]) -> WhitenedRows:
     """
     if not parts or len({part.parameters for part in parts}) != 1:
         raise ValueError(f"evidence of {[part.parameters for part in parts]} parameters cannot be joined")
-    return compressed(np.vstack([p.rows for p in parts]), np.concatenate([p.target for p in parts]))
+    matrix, vector = parts[0].matrix.copy(), parts[0].vector.copy()
+    for part in parts[1:]:
+        matrix += part.matrix
+        vector += part.vector
+    return _read_only(matrix, vector)
 
 
-def without_own(evidence: WhitenedRows, own_sigma: ArrayLike) -> WhitenedRows:
+def without_own(evidence: Evidence, own_sigma: ArrayLike) -> Evidence:
     """Return what is left when the first parameters are this stretch's own, known before to `own_sigma`."""
     sigma = np.asarray(own_sigma, dtype=float)
-    prior = np.zeros((sigma.size, evidence.parameters))
-    np.fill_diagonal(prior, 1.0 / sigma)
-    target = np.concatenate([np.zeros(sigma.size), evidence.target])
-    return _triangular(np.vstack([prior, evidence.rows]), target, sigma.size)
+    own, rest = slice(0, sigma.size), slice(sigma.size, None)
+    across = sigma[:, None] * evidence.matrix[own, rest]
+    columns = np.column_stack([across, sigma * evidence.vector[own]])
+    solved = _with_prior(sigma[:, None] * evidence.matrix[own, own] * sigma, columns)
+    return _read_only(
+        evidence.matrix[rest, rest] - across.T @ solved[:, :-1],
+        evidence.vector[rest] - across.T @ solved[:, -1],
+    )
 
 
-def find_change(
-    before: WhitenedRows, later: WhitenedRows, prior_sigma: ArrayLike, changes: Sequence[Array]
-) -> ChangeTest:
-    """Test what may have changed between two stretches of time.
+def find_changes(
+    before: Evidence, later: Evidence, prior_sigma: ArrayLike, changes: Sequence[Array]
+) -> tuple[Change, ...]:
+    """Return the best change of every hypothesis about what changed between two stretches of time.
 
     Args:
         before, later: about the same p parameters, as deviations from where a first model has them.
@@ -109,21 +120,38 @@ def find_change(
     Raises:
         ValueError: evidence about different parameters.
     """
-    sigma = np.asarray(prior_sigma, dtype=float)
-    count = sigma.size
-    if before.parameters != count or later.parameters != count:
-        raise ValueError(
-            f"evidence about {before.parameters} and {later.parameters} parameters, prior of {count}"
-        )
+    former, latter, sigma = _scaled(before, later, prior_sigma)
     # A robot without links has no link that could have changed.
-    wide = np.column_stack(changes) if changes else np.zeros((count, 0))
-    top = np.hstack([np.diag(1.0 / sigma), np.zeros((count, wide.shape[1] + 1))])
-    middle = np.column_stack([before.rows, np.zeros((len(before.rows), wide.shape[1])), before.target])
-    bottom = np.column_stack([later.rows, later.rows @ wide, later.target])
-    triangle = qr(np.vstack([top, middle, bottom]), mode="r", check_finite=False)[0][count:, count:]
-    target, ends = triangle[:, -1], np.cumsum([change.shape[1] for change in changes], dtype=np.int64)
-    columns = np.split(triangle[:, :-1], ends[:-1], axis=1) if changes else []
-    return ChangeTest(float(target @ target), tuple(_explained(own, target) for own in columns))
+    if not changes:
+        return ()
+    wide = np.column_stack(changes) / sigma[:, None]
+    seen = latter.matrix @ wide
+    columns = np.column_stack([seen, former.vector + latter.vector])
+    solved = _with_prior(former.matrix + latter.matrix, columns)
+    vector = wide.T @ latter.vector - seen.T @ solved[:, -1]
+    found, first = [], 0
+    for change in changes:
+        own = slice(first, first + change.shape[1])
+        matrix = wide[:, own].T @ seen[:, own] - seen[:, own].T @ solved[:, own]
+        found.append(_best_change(matrix, vector[own]))
+        first = own.stop
+    return tuple(found)
+
+
+def misfit_of(before: Evidence, later: Evidence, prior_sigma: ArrayLike) -> float:
+    """Return what there is to explain: by how much [variances] two robots fit better than one, each with the
+    prior.
+
+    Raises:
+        ValueError: evidence about different parameters.
+    """
+    former, latter, _ = _scaled(before, later, prior_sigma)
+    both = Evidence(former.matrix + latter.matrix, former.vector + latter.vector)
+    apart, together = [
+        sum(float(one.vector @ _with_prior(one.matrix, one.vector)) for one in robots)
+        for robots in ((former, latter), (both,))
+    ]
+    return apart - together
 
 
 def gain_above(freedom: int, tests_per_hour: float, alarms_per_hour: float) -> float:
@@ -134,19 +162,32 @@ def gain_above(freedom: int, tests_per_hour: float, alarms_per_hour: float) -> f
     return float(chdtri(freedom, min(alarms_per_hour / tests_per_hour, 1.0)))
 
 
-def _explained(columns: Array, target: Array) -> Change:
-    size = columns.shape[1]
-    normal = columns.T @ columns + np.eye(size)
-    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    best: Array = covariance @ (columns.T @ target)
-    off = columns @ best - target
-    gain = float(target @ target - off @ off - best @ best)
+def _read_only(matrix: Array, vector: Array) -> Evidence:
+    make_read_only((matrix, vector))
+    return Evidence(matrix, vector)
+
+
+def _scaled(before: Evidence, later: Evidence, prior_sigma: ArrayLike) -> tuple[Evidence, Evidence, Array]:
+    """Return both about parameters in standard deviations of their prior, and these."""
+    sigma = np.asarray(prior_sigma, dtype=float)
+    if before.parameters != sigma.size or later.parameters != sigma.size:
+        raise ValueError(
+            f"evidence about {before.parameters} and {later.parameters} parameters, prior of {sigma.size}"
+        )
+    former, latter = (
+        Evidence(sigma[:, None] * one.matrix * sigma, sigma * one.vector) for one in (before, later)
+    )
+    return former, latter, sigma
+
+
+def _with_prior(matrix: Array, columns: Array) -> Array:
+    """Return (1 + matrix)^-1 columns."""
+    factor = cho_factor(matrix + np.eye(len(matrix)), overwrite_a=True, check_finite=False)
+    return np.asarray(cho_solve(factor, columns, check_finite=False))
+
+
+def _best_change(matrix: Array, vector: Array) -> Change:
+    covariance = np.asarray(np.linalg.inv(matrix + np.eye(vector.size)), dtype=np.float64)
+    best: Array = covariance @ vector
     make_read_only((best, covariance))
-    return Change(gain, best, covariance)
-
-
-def _triangular(matrix: Array, vector: Array, first: int) -> WhitenedRows:
-    """Return what rows say of the parameters from the first on, by QR."""
-    triangle = qr(np.column_stack([matrix, vector]), mode="r", check_finite=False)[0]
-    kept = triangle[first : matrix.shape[1]]
-    return WhitenedRows(read_only(kept[:, first:-1].copy()), read_only(kept[:, -1].copy()))
+    return Change(float(vector @ best), best, covariance)

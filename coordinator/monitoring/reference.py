@@ -16,11 +16,12 @@ from coordinator.batch_estimation.estimator import with_placement
 from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuIntrinsics
 from coordinator.monitoring.contact import ContactModel, FastPart, contact_model
 from coordinator.monitoring.likelihood_ratio import (
-    ChangeTest,
-    WhitenedRows,
-    find_change,
+    Change,
+    Evidence,
+    find_changes,
     gain_above,
     joined,
+    misfit_of,
     without_own,
 )
 from coordinator.monitoring.momentum_observer import MomentumObserver
@@ -29,17 +30,17 @@ from coordinator.monitoring.residual_tests import (
     DriveModel,
     ImuModel,
     catalogued_drive,
+    drive_evidence,
     drive_rows,
     drive_window,
     fitted_drive,
-    imu_rows,
+    imu_evidence,
     information_of,
     lasting_residual,
     link_changes,
     payload_changes,
+    torque_evidence,
     torque_residual,
-    torque_rows,
-    whitened_drive_rows,
 )
 from coordinator.monitoring.segments import (
     SEGMENT_S,
@@ -81,21 +82,21 @@ class UnsuitableBaseline(UsageError):
 class BaselineTest(NamedTuple):
     """Evidence of the known run about one thing, and by how much its tests' gains are inflated there."""
 
-    evidence: WhitenedRows
+    evidence: Evidence
     prior_sigma: Array
     changes: tuple[Array, ...]
     inflation: float
 
-    def test(self, later: WhitenedRows) -> ChangeTest:
+    def find(self, later: Evidence) -> tuple[Change, ...]:
         """Test a later window; gains are those of well-behaved noise."""
-        found = find_change(self.evidence, later, self.prior_sigma, self.changes)
-        return ChangeTest(
-            found.misfit / self.inflation,
-            tuple(
-                c._replace(gain=c.gain / self.inflation, covariance=c.covariance * self.inflation)
-                for c in found.changes
-            ),
+        return tuple(
+            c._replace(gain=c.gain / self.inflation, covariance=c.covariance * self.inflation)
+            for c in find_changes(self.evidence, later, self.prior_sigma, self.changes)
         )
+
+    def misfit(self, later: Evidence) -> float:
+        """Return what there is to explain of a later window, as gains are."""
+        return misfit_of(self.evidence, later, self.prior_sigma) / self.inflation
 
 
 class Reference(NamedTuple):
@@ -192,10 +193,13 @@ def _torque(
 ) -> tuple[Array, tuple[JointInformation, ...], BaselineTest]:
     sigma, counted = noise_level([torque_residual(chain, phi, one) for one in segments])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
-    windows = [merge(*(information_of(chain, one) for one in window)) for window in _windows(segments)]
-    evidence = [torque_rows(window, phi, independent) for window in windows]
+    evidence = [
+        joined([torque_evidence(chain, phi, independent, one) for one in window])
+        for window in _windows(segments)
+    ]
     test = _calibrated(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
-    return independent, merge(*windows), test
+    whole = merge(*(information_of(chain, one) for window in _windows(segments) for one in window))
+    return independent, whole, test
 
 
 def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuModel, BaselineTest]:
@@ -208,7 +212,7 @@ def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuMode
     sigma, counted = noise_level(lasting_residual(rough, segments))
     model = rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
     evidence = [
-        without_own(joined([imu_rows(model, one) for one in window]), model.own_sigma)
+        without_own(joined([imu_evidence(model, one) for one in window]), model.own_sigma)
         for window in _windows(segments)
     ]
     return model, _calibrated(evidence, model.prior_sigma, link_changes(chain))
@@ -227,7 +231,7 @@ def _drive(
         noise = float(max(sigma[0], 1e-6) * np.sqrt(counted[0]))
     model = DriveModel(kind, theta, noise)
     windows = [
-        [e for one in window if (e := whitened_drive_rows(model, one, joint)) is not None]
+        [e for one in window if (e := drive_evidence(model, one, joint)) is not None]
         for window in _windows(segments)
     ]
     evidence = [drive_window(window) for window in windows if window]
@@ -235,16 +239,14 @@ def _drive(
     return model, _calibrated(evidence, model.prior_sigma, (model.change,)) if known else None
 
 
-def _calibrated(
-    windows: Sequence[WhitenedRows], prior_sigma: Array, changes: tuple[Array, ...]
-) -> BaselineTest:
+def _calibrated(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array, ...]) -> BaselineTest:
     """Return what all windows say, and by how much the tests of each against the others exceed chance."""
     # The median of the largest gain that chance makes in as many tests.
     expected = [chdtri(change.shape[1], 0.5 / (len(windows) * len(changes))) for change in changes]
     largest = 1.0
     for k, window in enumerate(windows):
-        found = find_change(joined([*windows[:k], *windows[k + 1 :]]), window, prior_sigma, changes)
-        gains = [change.gain / level for change, level in zip(found.changes, expected, strict=True)]
+        found = find_changes(joined([*windows[:k], *windows[k + 1 :]]), window, prior_sigma, changes)
+        gains = [change.gain / level for change, level in zip(found, expected, strict=True)]
         largest = max([largest, *gains])
     return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * largest)
 

@@ -28,15 +28,14 @@ from coordinator.batch_estimation.imu_intrinsics import DELAY, SIZE, ImuIntrinsi
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.monitoring.likelihood_ratio import WhitenedRows, compressed, joined, without_own
+from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, without_own
 from coordinator.monitoring.segments import DataSegment
-from coordinator.parameter_fit.base_parameters import whitened
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.information import JointInformation, gather
-from module_agent.model.read_only import read_only
-from module_agent.model.regressor import PER_BODY, inverse_dynamics
+from module_agent.model.read_only import make_read_only, read_only
+from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regressor
 
 # How far parameters may be from where a fit has them, per `parameter_scale`: bodies weigh some hundred grams.
 PRIOR_KG = 0.5
@@ -55,13 +54,15 @@ def torque_residual(chain: Chain, phi: Array, segment: DataSegment) -> Array:
     return np.asarray(segment.tau_nm - predicted)
 
 
-def torque_rows(information: Sequence[JointInformation], phi: Array, sigma_nm: Array) -> WhitenedRows:
-    """Return the evidence (k, 10 n) about phi's deviation from `phi`, in kilograms by `parameter_scale`.
+def torque_evidence(chain: Chain, phi: Array, sigma_nm: Array, segment: DataSegment) -> Evidence:
+    """Return the evidence about phi's deviation from `phi` (10 n,), in kilograms by `parameter_scale`.
 
     sigma_nm: (n,) noise as if samples were independent.
     """
-    rows, target = whitened(information, sigma_nm)
-    return compressed(rows * parameter_scale(len(information)), target - rows @ phi)
+    regressor = torque_regressor(chain, segment.q_rad, segment.qd_rad_s, segment.qdd_rad_s2)
+    rows = regressor * parameter_scale(len(chain.serials)) / sigma_nm[:, None]
+    residual = (segment.tau_nm - regressor @ phi) / sigma_nm
+    return evidence_of(rows.reshape(-1, rows.shape[-1]), residual.reshape(-1))
 
 
 def payload_changes(count: int) -> tuple[Array, ...]:
@@ -132,30 +133,35 @@ def lasting_residual(model: ImuModel, segments: Sequence[DataSegment]) -> list[A
     return [part.reshape(len(part), -1) for part in np.split(settled, ends)]
 
 
-def imu_rows(model: ImuModel, segment: DataSegment) -> WhitenedRows:
-    """Return the evidence (k, p): own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
+def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
+    """Return the evidence about own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
     at, count = _thinned(segment), len(model.chain.serials)
     bodies, ideal, residual = _predicted(model, at)
-    own = len(_OWN) * count
-    rows = np.zeros((count, len(at.q_rad), 6, own + len(model.prior_sigma)))
+    links = len(_OWN) * count
+    tilt = links + _PER_TWIST * count
+    total = links + len(model.prior_sigma)
+    matrix, vector = np.zeros((total, total)), np.zeros(total)
     free = np.ones(SIZE, dtype=bool)
     for k in range(count):
         moved = imu_jacobian(model.chain, bodies, at.q_rad, at.qd_rad_s, k)
         mixed = mixing(model.intrinsics, k)
-        poses = np.einsum("ij,cjm->mic", mixed, moved.poses)
-        for place, module in enumerate(moved.modules):
-            to = own + _PER_TWIST * module
-            rows[k, :, :, to : to + _PER_TWIST] = poses[..., _PER_TWIST * place : _PER_TWIST * (place + 1)]
-        tilt = own + _PER_TWIST * count
-        rows[k, :, :, tilt : tilt + 3] = np.einsum("ij,cjm->mic", mixed, moved.gravity)
         by_error = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], at.imu_rates[:, k], free)
-        by_error = np.moveaxis(by_error, 2, 0).swapaxes(1, 2)
-        rows[k, :, :, len(_OWN) * k : len(_OWN) * (k + 1)] = by_error[..., _OWN]
-        to = tilt + 3 + len(_LASTING) * k
-        rows[k, :, :, to : to + len(_LASTING)] = by_error[..., _LASTING]
-    weighted = rows / model.sigma[:, None, :, None]
-    target = np.swapaxes(residual, 0, 1) / model.sigma[:, None, :]
-    return compressed(weighted.reshape(-1, rows.shape[-1]), target.reshape(-1))
+        # Slopes (p, 6, m) by those parameters alone that this IMU depends on.
+        own = np.concatenate([by_error[_OWN], mixed @ moved.poses, mixed @ moved.gravity, by_error[_LASTING]])
+        columns = np.concatenate(
+            [
+                len(_OWN) * k + np.arange(len(_OWN)),
+                *(links + _PER_TWIST * module + np.arange(_PER_TWIST) for module in moved.modules),
+                tilt + np.arange(3),
+                tilt + 3 + len(_LASTING) * k + np.arange(len(_LASTING)),
+            ]
+        )
+        rows = (own / model.sigma[k, :, None]).reshape(len(columns), -1).T
+        part = evidence_of(rows, (residual[:, k] / model.sigma[k]).T.reshape(-1))
+        matrix[np.ix_(columns, columns)] += part.matrix
+        vector[columns] += part.vector
+    make_read_only((matrix, vector))
+    return Evidence(matrix, vector)
 
 
 def link_changes(chain: Chain) -> tuple[Array, ...]:
@@ -241,7 +247,7 @@ def drive_rows(kind: ModuleType, segment: DataSegment, joint: int) -> tuple[Arra
     return rows[turning], motor[turning]
 
 
-def whitened_drive_rows(model: DriveModel, segment: DataSegment, joint: int) -> WhitenedRows | None:
+def drive_evidence(model: DriveModel, segment: DataSegment, joint: int) -> Evidence | None:
     """Return the evidence about the drive's deviation from its model; None if the motor stood.
 
     Before the six parameters are those of how torque is passed on, the stretch's own (2,): see `OWN_SIGMA`.
@@ -250,11 +256,11 @@ def whitened_drive_rows(model: DriveModel, segment: DataSegment, joint: int) -> 
     if len(rows) < MIN_SAMPLES:
         return None
     weighted = np.column_stack([rows[:, : OWN_SIGMA.size], rows]) / model.sigma_nm
-    return compressed(weighted, (torque - rows @ model.theta) / model.sigma_nm)
+    return evidence_of(weighted, (torque - rows @ model.theta) / model.sigma_nm)
 
 
-def drive_window(parts: Sequence[WhitenedRows]) -> WhitenedRows:
-    """Return the evidence (k, 6) of a window's stretches together."""
+def drive_window(parts: Sequence[Evidence]) -> Evidence:
+    """Return the evidence about the six parameters of a window's stretches together."""
     return without_own(joined(parts), OWN_SIGMA)
 
 

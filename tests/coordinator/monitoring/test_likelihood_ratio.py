@@ -6,11 +6,12 @@ from numpy.random import Generator
 from scipy.stats import chi2
 
 from coordinator.monitoring.likelihood_ratio import (
-    WhitenedRows,
-    compressed,
-    find_change,
+    Evidence,
+    evidence_of,
+    find_changes,
     gain_above,
     joined,
+    misfit_of,
     without_own,
 )
 
@@ -32,7 +33,7 @@ def test_gain_and_size_are_those_of_least_squares_over_all_samples_at_once(rng: 
     theta = rng.normal(size=PARAMETERS)
     changed = theta + CHANGE @ [0.004, -0.002]
     (b, y), (later, z) = measured(rng, theta), measured(rng, changed)
-    found = find_change(compressed(b, y), compressed(later, z), WIDE, (CHANGE,)).changes[0]
+    found = find_changes(evidence_of(b, y), evidence_of(later, z), WIDE, (CHANGE,))[0]
     # All samples, the prior of theta and that of the change as rows of their own.
     none = np.zeros((len(b), 2))
     rows = np.vstack(
@@ -55,10 +56,10 @@ def test_gain_and_size_are_those_of_least_squares_over_all_samples_at_once(rng: 
 
 def test_chance_exceeds_a_level_as_seldom_as_was_asked_for(rng: Generator) -> None:
     theta = rng.normal(size=PARAMETERS)
-    before = compressed(*measured(rng, theta, 2000))
+    before = evidence_of(*measured(rng, theta, 2000))
     gains = np.array(
         [
-            find_change(before, compressed(*measured(rng, theta, 50)), WIDE, (CHANGE,)).changes[0].gain
+            find_changes(before, evidence_of(*measured(rng, theta, 50)), WIDE, (CHANGE,))[0].gain
             for _ in range(1500)
         ]
     )
@@ -71,41 +72,77 @@ def test_chance_exceeds_a_level_as_seldom_as_was_asked_for(rng: Generator) -> No
 def test_what_neither_stretch_tells_makes_no_gain(rng: Generator) -> None:
     rows = rng.normal(size=(100, PARAMETERS))
     rows[:, :2] = 0.0
-    quiet = compressed(rows, rng.normal(size=100))
-    assert find_change(quiet, quiet, WIDE, (CHANGE,)).changes[0].gain == pytest.approx(0.0, abs=1e-9)
+    quiet = evidence_of(rows, rng.normal(size=100))
+    assert find_changes(quiet, quiet, WIDE, (CHANGE,))[0].gain == pytest.approx(0.0, abs=1e-9)
 
 
 def test_joined_evidence_is_that_of_all_samples_in_any_order(rng: Generator) -> None:
-    parts = [compressed(*measured(rng, np.ones(PARAMETERS))) for _ in range(3)]
+    parts = [evidence_of(*measured(rng, np.ones(PARAMETERS))) for _ in range(3)]
     one, other = joined(parts), joined(parts[::-1])
     for a, b in ((one, other), (one, joined([joined(parts[:2]), parts[2]]))):
-        np.testing.assert_allclose(a.rows.T @ a.rows, b.rows.T @ b.rows, rtol=1e-10)
-        np.testing.assert_allclose(a.rows.T @ a.target, b.rows.T @ b.target, rtol=1e-10)
+        np.testing.assert_allclose(a.matrix, b.matrix, rtol=1e-10)
+        np.testing.assert_allclose(a.vector, b.vector, rtol=1e-10)
 
 
 def test_own_parameters_are_left_out_as_a_schur_complement_does(rng: Generator) -> None:
     rows, target = measured(rng, np.ones(PARAMETERS))
-    left = without_own(compressed(rows, target), [0.5, 0.5])
+    left = without_own(evidence_of(rows, target), [0.5, 0.5])
     normal = rows.T @ rows
     normal[:2, :2] += 4.0 * np.eye(2)
     expected = normal[2:, 2:] - normal[2:, :2] @ np.linalg.solve(normal[:2, :2], normal[:2, 2:])
-    np.testing.assert_allclose(left.rows.T @ left.rows, expected, rtol=1e-9)
+    np.testing.assert_allclose(left.matrix, expected, rtol=1e-9)
 
 
 def test_evidence_about_other_parameters_is_refused() -> None:
-    one = WhitenedRows(np.eye(3), np.zeros(3))
-    other = WhitenedRows(np.eye(4), np.zeros(4))
+    one = Evidence(np.eye(3), np.zeros(3))
+    other = Evidence(np.eye(4), np.zeros(4))
     with pytest.raises(ValueError, match="cannot be joined"):
         joined([one, other])
     with pytest.raises(ValueError, match="prior of 3"):
-        find_change(one, other, np.ones(3), (np.eye(3),))
+        find_changes(one, other, np.ones(3), (np.eye(3),))
     with pytest.raises(ValueError, match="not finite"):
-        compressed([[np.nan]], [0.0])
+        evidence_of([[np.nan]], [0.0])
 
 
-def test_where_nothing_could_have_changed_there_is_a_misfit_and_no_change(rng: Generator) -> None:
+def test_where_nothing_could_have_changed_there_is_no_change(rng: Generator) -> None:
     """A robot of one module has no link."""
-    evidence = compressed(*measured(rng, rng.normal(size=PARAMETERS)))
-    found = find_change(evidence, evidence, WIDE, ())
-    assert found.changes == ()
-    assert found.misfit > 0.0
+    evidence = evidence_of(*measured(rng, rng.normal(size=PARAMETERS)))
+    assert find_changes(evidence, evidence, WIDE, ()) == ()
+
+
+def test_the_misfit_of_one_robot_is_chance_and_of_two_what_sets_them_apart(rng: Generator) -> None:
+    theta = rng.normal(size=PARAMETERS)
+    before = evidence_of(*measured(rng, theta, 2000))
+    same = [misfit_of(before, evidence_of(*measured(rng, theta, 50)), WIDE) for _ in range(300)]
+    # The mean of 300 chi-square draws of 6 degrees of freedom: within 3.5 sigmas of 0.2.
+    assert np.mean(same) == pytest.approx(PARAMETERS, abs=0.7)
+    rows, target = measured(rng, theta + 1.0, 50)
+    apart = evidence_of(rows, target)
+    # Two robots leave the noise, one leaves besides it what their difference makes of the later rows.
+    assert misfit_of(before, apart, WIDE) == pytest.approx(np.sum((rows @ np.ones(PARAMETERS)) ** 2), rel=0.3)
+
+
+def test_rows_that_hardly_tell_a_parameter_keep_the_gain_of_a_qr(rng: Generator) -> None:
+    """The information matrix squares the condition number: that of long runs is 1e5 in units of the prior."""
+    weight = np.array([1e5, 1e4, 1e2, 1.0, 1e-2, 1e-4])
+    theta = rng.normal(size=PARAMETERS)
+    b, later = (rng.normal(size=(400, PARAMETERS)) * weight for _ in range(2))
+    y, z = (
+        b @ theta + rng.normal(size=400),
+        later @ (theta + 3.0 * np.eye(PARAMETERS)[3]) + rng.normal(size=400),
+    )
+    change = np.eye(PARAMETERS)[:, 2:4]
+    found = find_changes(evidence_of(b, y), evidence_of(later, z), np.ones(PARAMETERS), (change,))[0]
+    rows = np.vstack(
+        [
+            np.column_stack([b, np.zeros((400, 2))]),
+            np.column_stack([later, later @ change]),
+            np.eye(PARAMETERS + 2),
+        ]
+    )
+    target = np.concatenate([y, z, np.zeros(PARAMETERS + 2)])
+    misfits = []
+    for columns in (PARAMETERS, PARAMETERS + 2):
+        q = np.linalg.qr(rows[:, :columns])[0]
+        misfits.append(np.sum((target - q @ (q.T @ target)) ** 2))
+    assert found.gain == pytest.approx(misfits[0] - misfits[1], rel=1e-5)
