@@ -1,7 +1,7 @@
-"""Which change explains what a window of motion shows: a drive, a link, a payload, or nothing known.
+"""Which change explains what a window shows: a drive, a link, a payload, a sensor, or nothing known.
 
 A link that is displaced changes torques too; so where IMUs say that one is, that explains them. Torques alone
-that have changed are a payload's if one body explains them.
+that have changed are a payload's if one body explains them. Both have a sensor's errors as rivals.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from scipy.special import chdtri
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.contact import Contact
 from coordinator.monitoring.findings import Detection
-from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, without_own
+from coordinator.monitoring.likelihood_ratio import Change, Evidence
 from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
     UNIT_PAYLOAD_KG,
@@ -24,10 +24,13 @@ from coordinator.monitoring.residual_tests import (
     drive_evidence,
     drive_window,
     imu_evidence,
+    imu_window,
     information_of,
     torque_evidence,
+    torque_window,
 )
 from coordinator.monitoring.segments import DataSegment
+from coordinator.monitoring.sensor_errors import LEAD, drive_offset, imu_error, torque_sensor_error
 from coordinator.parameter_fit.payload import find_payload
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from module_agent.model.chain import Array, Chain
@@ -78,19 +81,24 @@ class SegmentInformation:
 
 class LoadShift(NamedTuple):
     """Torques that have changed: index of the body that explains most of it, gain, what it leaves, and by
-    how much the body's parameters (10,) change then."""
+    how much the body's parameters (10,) change then.
+
+    sensor: the torque sensor that explains more, if one does.
+    """
 
     carrier: int
     gain: float
     left: float
     change: Array
+    sensor: Detection | None
 
 
 class Diagnosis(NamedTuple):
-    """What a window shows; None of what has not changed."""
+    """What a window shows; None of what has not changed. structure: a displaced link, or the IMU that seems
+    to be on one."""
 
     drives: tuple[Detection, ...]
-    link: Detection | None
+    structure: Detection | None
     load: LoadShift | None
 
 
@@ -120,7 +128,7 @@ def diagnose(
     """
     return Diagnosis(
         _drives(reference, thresholds, window),
-        _link(reference, thresholds, window, loaded),
+        _structure(reference, thresholds, window, loaded),
         _load(reference, thresholds, window),
     )
 
@@ -134,14 +142,19 @@ def _drives(
 ) -> tuple[Detection, ...]:
     found = []
     for joint, (model, known) in enumerate(zip(reference.drive_models, reference.drives, strict=True)):
-        parts = [rows for segment in window if (rows := segment.drives[joint]) is not None]
+        parts = _drive_parts(window, joint)
         if known is None or not parts:
             continue
-        change = known.find(drive_window(parts))[0]
+        later = drive_window(parts)
+        change = known.find(later)[0]
         scaled = model.relative_friction
         sigma, more = float(np.sqrt(scaled @ change.covariance @ scaled)), float(scaled @ change.size)
         if change.gain > thresholds.drive and abs(more) > MIN_FRICTION + 3.0 * sigma:
             serial = reference.chain.serials[joint]
+            offset = drive_offset(known, model, joint, later)
+            if offset.gain > change.gain + LEAD:
+                found.append(offset.detection(serial, thresholds.drive))
+                continue
             summary = (
                 f"the drive of {serial} has {abs(100.0 * more):.0f} +- {100.0 * sigma:.0f} % "
                 f"{'more' if more > 0.0 else 'less'} friction at half its speed"
@@ -154,19 +167,22 @@ def _drives(
     return tuple(found)
 
 
-def _link(
+def _structure(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
 ) -> Detection | None:
     chain = reference.chain
     # At rest an IMU shows which way is down, by its own errors and in whatever pose, and no length.
     if not chain.linked or 2 * sum(segment.moved for segment in window) < len(window):
         return None
-    later = without_own(joined([segment.imu for segment in window]), reference.imu_model.own_sigma)
-    found = reference.imu.find(later)
+    parts = [segment.imu for segment in window]
+    found = reference.imu.find(imu_window(reference.imu_model, parts))
     most = _most(found)
     best, child = found[most], chain.linked[most]
     if best.gain < thresholds.link:
         return None
+    sensor = imu_error(reference.imu, reference.imu_model, parts)
+    if sensor.gain > best.gain + LEAD:
+        return sensor.detection(chain.serials[sensor.place], thresholds.link)
     turn, shift = displacement(chain, child, best.size)
     length = float(np.linalg.norm(shift))
     slope = np.array([shift / max(length, 1e-9) @ displacement(chain, child, unit)[1] for unit in np.eye(6)])
@@ -185,14 +201,38 @@ def _link(
 def _load(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation]
 ) -> LoadShift | None:
-    later = joined([segment.torque for segment in window])
+    parts = [segment.torque for segment in window]
+    later = torque_window(parts)
     found = reference.torque.find(later)
     carrier = _most(found)
     best = found[carrier]
     if best.gain < thresholds.payload:
         return None
     change = UNIT_PAYLOAD_KG * parameter_scale(1) * best.size
-    return LoadShift(carrier, best.gain, reference.torque.misfit(later) - best.gain, change)
+    left = reference.torque.misfit(later) - best.gain
+    return LoadShift(
+        carrier, best.gain, left, change, _torque_sensor(reference, thresholds, window, best.gain)
+    )
+
+
+def _torque_sensor(
+    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], gain: float
+) -> Detection | None:
+    """Return the torque sensor that explains more than a payload of some gain, or whose drive shows it."""
+    rival = torque_sensor_error(reference.torque, [segment.torque for segment in window])
+    joint = rival.place
+    found = rival.detection(reference.chain.serials[joint], thresholds.payload)
+    if rival.gain > gain + LEAD:
+        return found
+    known, parts = reference.drives[joint], _drive_parts(window, joint)
+    if known is None or not parts:
+        return None
+    offset = drive_offset(known, reference.drive_models[joint], joint, drive_window(parts))
+    return found if offset.gain > thresholds.drive else None
+
+
+def _drive_parts(window: Sequence[SegmentInformation], joint: int) -> list[Evidence]:
+    return [rows for segment in window if (rows := segment.drives[joint]) is not None]
 
 
 def _most(changes: Sequence[Change]) -> int:

@@ -8,7 +8,9 @@ from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict
 
-Kind = Literal["collision", "payload", "friction", "wear", "unexplained"]
+Kind = Literal[
+    "collision", "payload", "friction", "wear", "unexplained", "torque-sensor", "gyro", "accelerometer"
+]
 # By what each kind's size is measured.
 UNITS: dict[Kind, str] = {
     "collision": "Nm",
@@ -16,7 +18,12 @@ UNITS: dict[Kind, str] = {
     "friction": "%",
     "wear": "mm",
     "unexplained": "Nm",
+    "torque-sensor": "Nm",
+    "gyro": "mrad/s",
+    "accelerometer": "m/s^2",
 }
+# What IMUs show, of which one at a time holds; torques have the rest.
+STRUCTURAL: tuple[Kind, ...] = ("wear", "gyro", "accelerometer")
 KINDS = tuple(UNITS)
 
 
@@ -25,7 +32,7 @@ class Finding(BaseModel):
 
     serial: the module: for a collision, the last joint whose torque crossed its level: the contact is on a
     body that this joint moves; for a payload, the joint that moves the loaded body; for friction, the drive;
-    for wear, the module whose link to its parent changed.
+    for wear, the module whose link to its parent changed; for a sensor, its module.
     since_ns, detected_ns, reported_ns, until_ns: session time of its beginning, of the first and the last
     report, and of its end, None as long as it lasts.
     size, sigma: in `unit`, one standard deviation. gain: reduction of the residual's sum of squares in
@@ -53,7 +60,7 @@ class Finding(BaseModel):
         """What makes it the same finding as an earlier one: a later word on it replaces the earlier."""
         if self.kind in ("collision", "friction"):
             return self.kind, self.since_ns if self.kind == "collision" else self.serial
-        return "structure" if self.kind == "wear" else "load", 0
+        return "structure" if self.kind in STRUCTURAL else "load", 0
 
 
 class Detection(NamedTuple):

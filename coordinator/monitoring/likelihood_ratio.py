@@ -106,6 +106,11 @@ def without_own(evidence: Evidence, own_sigma: ArrayLike) -> Evidence:
     )
 
 
+def without_first(evidence: Evidence, count: int) -> Evidence:
+    """Return what is left when the first so many parameters are known to be where the model has them."""
+    return Evidence(evidence.matrix[count:, count:], evidence.vector[count:])
+
+
 def find_changes(
     before: Evidence, later: Evidence, prior_sigma: ArrayLike, changes: Sequence[Array]
 ) -> tuple[Change, ...]:

@@ -19,7 +19,7 @@ from coordinator.monitoring.diagnosis import (
     unexplained,
     weighed,
 )
-from coordinator.monitoring.findings import Finding, FindingLog, Key
+from coordinator.monitoring.findings import STRUCTURAL, Finding, FindingLog, Key
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, SPANS, Reference, Thresholds, thresholds
 from coordinator.monitoring.segments import Alignment, Block, Gap, Segmenter
 from coordinator.recording.recording import Recording
@@ -159,16 +159,23 @@ class Monitor:
         # Friction is in no hurry, and in a short window other things pass for it.
         long = [(one, window) for one, window in diagnosed if len(window) >= max(SPANS)]
         latest = {d.serial: d.finding(window[0].start_ns, now_ns) for one, window in long for d in one.drives}
-        return [news for finding in latest.values() for news in self.finding_log.put(finding)]
+        # What a torque sensor reads too much passes for friction.
+        sick = [one.serial for one in self.finding_log.held.values() if one.kind == "torque-sensor"]
+        credible = [one for one in latest.values() if one.kind == "torque-sensor" or one.serial not in sick]
+        return [news for finding in credible for news in self.finding_log.put(finding)]
 
     def _hypothesis(self, diagnosed: _Diagnosed) -> _Hypothesis | None:
         """Return what explains the newest windows; those since the change began come first."""
         found, serials = None, self.reference.chain.serials
         for one, window in reversed(diagnosed):
-            if one.link is not None:
-                found = _Hypothesis("wear", one.link.serial, one, window)
+            if one.structure is not None:
+                found = _Hypothesis(one.structure.kind, one.structure.serial, one, window)
                 break
-            if found is None and one.load is not None and explains(self.reference, one.load):
+            if found is not None or one.load is None:
+                continue
+            if one.load.sensor is not None:
+                found = _Hypothesis("torque-sensor", one.load.sensor.serial, one, window)
+            elif explains(self.reference, one.load):
                 found = _Hypothesis("payload", serials[one.load.carrier], one, window)
         if found is None:
             # What the newest segments do not show any more was too weak a blow to be detected as one.
@@ -195,7 +202,10 @@ class Monitor:
         kind, log = hypothesis.kind, self.finding_log
         if self._agreed_for < (UNEXPLAINED_AFTER if kind == "unexplained" else CONFIRMED):
             return []
-        if kind != "wear" and self._held("wear"):
+        if kind not in STRUCTURAL and self._held(*STRUCTURAL):
+            return []
+        # By a torque sensor that is off nothing can be weighed.
+        if kind in ("payload", "unexplained") and self._held("torque-sensor"):
             return []
         held = log.held.get(("load", 0))
         settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == kind
@@ -203,8 +213,10 @@ class Monitor:
             # It takes a while to weigh it, and it will not be another.
             log.observe(("load", 0), now_ns)
             return []
-        detection, load = hypothesis.diagnosis.link, hypothesis.diagnosis.load
-        if load is not None and kind == "unexplained":
+        detection, load = hypothesis.diagnosis.structure, hypothesis.diagnosis.load
+        if load is not None and kind == "torque-sensor":
+            detection = load.sensor
+        elif load is not None and kind == "unexplained":
             detection = unexplained(self.reference, self.thresholds, load)
         elif load is not None and kind == "payload":
             detection = weighed(self.reference, self.thresholds, hypothesis.window, load)
@@ -230,10 +242,14 @@ class Monitor:
         )
 
     def _withdrawn(self, findings: Sequence[Finding], now_ns: int) -> list[Key]:
-        """Withdraw what a change explains: loads if a link is displaced, contacts of its beginning."""
-        lasting = [f for f in findings if f.kind in ("payload", "wear", "unexplained")]
-        wear = any(f.kind == "wear" for f in lasting)
-        withdrawn = self.finding_log.withdraw([("load", 0)] if wear else [])
+        """Withdraw what a change explains: loads if a link or an IMU is off, friction if the joint's torque
+        sensor is, contacts of its beginning."""
+        lasting = [f for f in findings if f.kind not in ("collision", "friction")]
+        structural = any(f.kind in STRUCTURAL for f in lasting)
+        withdrawn = self.finding_log.withdraw([("load", 0)] if structural else [])
+        withdrawn += self.finding_log.withdraw(
+            ("friction", f.serial) for f in lasting if f.kind == "torque-sensor"
+        )
         for change in lasting:
             withdrawn += self._without_collisions(change.since_ns, now_ns)
         return withdrawn

@@ -22,7 +22,6 @@ from coordinator.monitoring.likelihood_ratio import (
     gain_above,
     joined,
     misfit_of,
-    without_own,
 )
 from coordinator.monitoring.momentum_observer import MomentumObserver
 from coordinator.monitoring.residual_tests import (
@@ -35,12 +34,14 @@ from coordinator.monitoring.residual_tests import (
     drive_window,
     fitted_drive,
     imu_evidence,
+    imu_window,
     information_of,
     lasting_residual,
     link_changes,
     payload_changes,
     torque_evidence,
     torque_residual,
+    torque_window,
 )
 from coordinator.monitoring.segments import (
     SEGMENT_S,
@@ -194,7 +195,7 @@ def _torque(
     sigma, counted = noise_level([torque_residual(chain, phi, one) for one in segments])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
     evidence = [
-        joined([torque_evidence(chain, phi, independent, one) for one in window])
+        torque_window([torque_evidence(chain, phi, independent, one) for one in window])
         for window in _windows(segments)
     ]
     test = _calibrated(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
@@ -212,8 +213,7 @@ def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuMode
     sigma, counted = noise_level(lasting_residual(rough, segments))
     model = rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
     evidence = [
-        without_own(joined([imu_evidence(model, one) for one in window]), model.own_sigma)
-        for window in _windows(segments)
+        imu_window(model, [imu_evidence(model, one) for one in window]) for window in _windows(segments)
     ]
     return model, _calibrated(evidence, model.prior_sigma, link_changes(chain))
 

@@ -20,7 +20,7 @@ so that slow samples do not count.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from coordinator.batch_estimation.imu_intrinsics import DELAY, SIZE, ImuIntrinsi
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, without_own
+from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, without_first, without_own
 from coordinator.monitoring.segments import DataSegment
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
@@ -39,6 +39,8 @@ from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regr
 
 # How far parameters may be from where a fit has them, per `parameter_scale`: bodies weigh some hundred grams.
 PRIOR_KG = 0.5
+# Of a torque sensor: offset and scale.
+SENSOR_ERRORS = 2
 # Of a payload: a change of 1 is one of a kilogram at the body's place.
 UNIT_PAYLOAD_KG = 1.0
 
@@ -55,14 +57,28 @@ def torque_residual(chain: Chain, phi: Array, segment: DataSegment) -> Array:
 
 
 def torque_evidence(chain: Chain, phi: Array, sigma_nm: Array, segment: DataSegment) -> Evidence:
-    """Return the evidence about phi's deviation from `phi` (10 n,), in kilograms by `parameter_scale`.
+    """Return the evidence about torque sensors' offsets [Nm] and scales (2 n), then about phi.
 
-    sigma_nm: (n,) noise as if samples were independent.
+    phi (10 n) is its deviation from `phi` in kilograms by `parameter_scale`. sigma_nm: (n,) noise as if
+    samples were independent.
     """
+    count = len(chain.serials)
     regressor = torque_regressor(chain, segment.q_rad, segment.qd_rad_s, segment.qdd_rad_s2)
-    rows = regressor * parameter_scale(len(chain.serials)) / sigma_nm[:, None]
-    residual = (segment.tau_nm - regressor @ phi) / sigma_nm
+    predicted = regressor @ phi
+    rows = np.zeros((*predicted.shape, (SENSOR_ERRORS + PER_BODY) * count))
+    joint = np.arange(count)
+    rows[:, joint, joint] = 1.0
+    rows[:, joint, count + joint] = predicted
+    rows[..., SENSOR_ERRORS * count :] = regressor * parameter_scale(count)
+    rows /= sigma_nm[:, None]
+    residual = (segment.tau_nm - predicted) / sigma_nm
     return evidence_of(rows.reshape(-1, rows.shape[-1]), residual.reshape(-1))
+
+
+def torque_window(parts: Sequence[Evidence]) -> Evidence:
+    """Return the evidence about phi (10 n) of a window's stretches together, if their sensors are well."""
+    whole = joined(parts)
+    return without_first(whole, whole.parameters // (SENSOR_ERRORS + PER_BODY) * SENSOR_ERRORS)
 
 
 def payload_changes(count: int) -> tuple[Array, ...]:
@@ -77,6 +93,12 @@ KEEP_EVERY = 5
 _OWN = [*range(18, 24), DELAY]
 _LASTING = [k for k in range(SIZE) if k not in _OWN]
 _PER_TWIST = 6
+ImuSensor = Literal["gyro", "accelerometer"]
+# Biases, and scales of the axes.
+IMU_ERRORS: dict[ImuSensor, tuple[range, range]] = {
+    "gyro": (range(18, 21), range(0, 9, 4)),
+    "accelerometer": (range(21, 24), range(9, 18, 4)),
+}
 # How far the known links may be off, in radians and metres; gravity, in m/s^2; own biases against those of
 # the known run, and delays against those of no filter at all.
 _LINK_SIGMA, _GRAVITY_SIGMA = 0.02, 0.05
@@ -164,6 +186,25 @@ def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
     return Evidence(matrix, vector)
 
 
+def imu_window(model: ImuModel, parts: Sequence[Evidence]) -> Evidence:
+    """Return the evidence about what stays of a window's stretches together."""
+    return without_own(joined(parts), model.own_sigma)
+
+
+def imu_error_columns(count: int, sensor: ImuSensor) -> list[Array]:
+    """Return per module the columns (6,) of `imu_evidence` that its sensor's biases and scales are in."""
+    bias, scale = IMU_ERRORS[sensor]
+    lasting = (len(_OWN) + _PER_TWIST) * count + 3
+    places = [_OWN.index(one) for one in bias], [_LASTING.index(one) for one in scale]
+    return [
+        np.array(
+            [len(_OWN) * k + one for one in places[0]]
+            + [lasting + len(_LASTING) * k + one for one in places[1]]
+        )
+        for k in range(count)
+    ]
+
+
 def link_changes(chain: Chain) -> tuple[Array, ...]:
     """Return the hypotheses, one for every module but those on the base: all beyond its link is displaced."""
     count = len(chain.serials)
@@ -220,6 +261,13 @@ class DriveModel(NamedTuple):
         """The hypothesis: Coulomb and viscous friction change, by as much as the catalogue has them."""
         found = np.zeros((TERMS, 2))
         found[_FRICTION] = np.diag(catalogued_drive(self.kind)[_FRICTION])
+        return found
+
+    @property
+    def offset_change(self) -> Array:
+        """The rival hypothesis: the torque sensor's offset changes; in units of a twentieth of its range."""
+        found = np.zeros((TERMS, 1))
+        found[-1] = 0.05 * self.kind.max_effort_nm
         return found
 
     @property

@@ -131,9 +131,8 @@ class Life(NamedTuple):
 
     def _right(self, one: Said) -> bool:
         assert self.change is not None
-        growth = GROWTHS[self.change.kind]
-        here = one.serial == self.change.serial or not growth.located
-        return one.kind == growth.named and here
+        here = one.kind == "unexplained" or one.serial == self.change.serial
+        return one.kind in GROWTHS[self.change.kind].named and here
 
 
 class KnownRobot(NamedTuple):

@@ -37,31 +37,30 @@ CHANGE_KINDS: tuple[ChangeKind, ...] = get_args(ChangeKind)
 
 
 class Growth(NamedTuple):
-    """A kind of change: unit of its size, range of its final size, and as what a finding names it rightly.
+    """A kind of change: unit of its size, range of its final size, and as what findings name it rightly.
 
-    named: the kind of a right finding, None if the monitor has no word for it. located: whether a right
-    finding names the module too.
+    named: the kinds of right findings, none if the monitor has no word for it; all but `unexplained`, which
+    is nowhere, have to name the module too.
     """
 
     unit: str
     sizes: tuple[float, float]
-    named: Kind | None
-    located: bool = True
+    named: tuple[Kind, ...]
 
 
 # Torque errors and play of a module are relative to its largest torque, and in mrad; IMUs' scales in percent.
 GROWTHS: dict[ChangeKind, Growth] = {
-    "payload": Growth("kg", (0.1, 0.4), "payload"),
-    "link": Growth("mm", (6.0, 12.0), "wear"),
-    "friction": Growth("%", (50.0, 100.0), "friction"),
-    "play": Growth("mrad", (5.0, 20.0), None),
-    "hysteresis": Growth("% of the largest torque", (2.0, 5.0), "unexplained", located=False),
-    "torque-scale": Growth("%", (5.0, 15.0), "unexplained", located=False),
-    "torque-offset": Growth("% of the largest torque", (2.0, 5.0), "unexplained", located=False),
-    "gyro-bias": Growth("mrad/s", (10.0, 50.0), None),
-    "accel-bias": Growth("m/s^2", (0.2, 1.0), None),
-    "gyro-scale": Growth("%", (2.0, 6.0), None),
-    "accel-scale": Growth("%", (2.0, 6.0), None),
+    "payload": Growth("kg", (0.1, 0.4), ("payload",)),
+    "link": Growth("mm", (6.0, 12.0), ("wear",)),
+    "friction": Growth("%", (50.0, 100.0), ("friction",)),
+    "play": Growth("mrad", (5.0, 20.0), ()),
+    "hysteresis": Growth("% of the largest torque", (2.0, 5.0), ("unexplained", "torque-sensor")),
+    "torque-scale": Growth("%", (5.0, 15.0), ("unexplained", "torque-sensor")),
+    "torque-offset": Growth("% of the largest torque", (2.0, 5.0), ("unexplained", "torque-sensor")),
+    "gyro-bias": Growth("mrad/s", (10.0, 50.0), ("gyro",)),
+    "accel-bias": Growth("m/s^2", (0.2, 1.0), ("accelerometer",)),
+    "gyro-scale": Growth("%", (2.0, 6.0), ("gyro",)),
+    "accel-scale": Growth("%", (2.0, 6.0), ("accelerometer",)),
 }
 
 

@@ -32,7 +32,7 @@ from sim.commands.experiment import ProfileName, WorkerCount, experiment, trial_
 from sim.commands.options import Seed, load
 from sim.imperfections.noise_profile import noise_profile
 
-_KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
+_KINDS: tuple[Kind, ...] = ("collision", "payload", "friction", "wear")
 
 
 def monitoring(

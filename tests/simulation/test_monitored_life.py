@@ -3,14 +3,19 @@
 import numpy as np
 import pytest
 
+from coordinator.monitoring.findings import Kind
 from coordinator.monitoring.reference import ALONE_FACTOR
 from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, known_robot_of, monitored_life
+from sim.benchmark.slow_change import ChangeKind
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("monitored life")
 
 # A robot that half a minute has made known, with calibrated sensors.
 PLAN = LifePlan("a2085_03", 3, "x5", day=0, for_s=20.0, excitation="d-optimal", brief=True)
+
+# Days on which the drawn change is one of the larger ones.
+DAYS: dict[ChangeKind, int] = {"torque-offset": 0, "accel-bias": 2}
 
 
 def test_friction_that_doubles_is_named_on_its_module() -> None:
@@ -21,6 +26,20 @@ def test_friction_that_doubles_is_named_on_its_module() -> None:
     assert named.serial == stiff.change.serial
     assert named.t_s > stiff.change.from_s
     assert named.change_size > 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"), [("torque-offset", "torque-sensor"), ("accel-bias", "accelerometer")]
+)
+def test_a_sensor_that_goes_off_is_named_on_its_module_and_nothing_else_is_in_the_end(
+    change: ChangeKind, kind: Kind
+) -> None:
+    """Grown within ten seconds; for a payload or a displaced link it is taken for seconds at most."""
+    sick = monitored_life(
+        PLAN._replace(change=change, for_s=60.0, from_s=12.0, over_s=10.0, day=DAYS[change])
+    )
+    assert sick.outcome == "rightly", sick.said
+    assert {one.kind for one in sick.rightly} == {kind}
 
 
 def test_a_seed_repeats_a_life_and_another_day_is_another_life() -> None:

@@ -14,7 +14,7 @@ from scipy.special import gammainccinv, gammaincinv
 
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
-from coordinator.monitoring.findings import Finding
+from coordinator.monitoring.findings import Finding, Kind
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, Reference, build_reference
 from module_agent.model.chain import Chain
@@ -31,7 +31,7 @@ from sim.world.external_force import Push
 
 Happens = Literal["nothing", "collision", "payload", "friction", "wear"]
 KINDS: tuple[Happens, ...] = ("collision", "payload", "friction", "wear")
-Found = Literal["nothing", "collision", "payload", "friction", "wear", "unexplained"]
+Found = Literal["nothing"] | Kind
 
 # Trials that share a robot, each a day of it; a robot's own day is the first.
 DAYS = 1000

@@ -44,8 +44,11 @@ def test_a_change_is_named_rightly_by_kind_and_module() -> None:
     assert life("friction", said(200.0, "friction", kept=False)).outcome == "missed"
 
 
-def test_a_torque_sensor_is_named_without_its_module_and_play_by_nothing() -> None:
+def test_a_sensor_is_named_with_its_module_or_as_unexplained_and_play_by_nothing() -> None:
     assert life("torque-scale", said(200.0, "unexplained", OTHER)).outcome == "rightly"
+    assert life("torque-scale", said(200.0, "torque-sensor")).outcome == "rightly"
+    assert life("torque-scale", said(200.0, "torque-sensor", OTHER)).outcome == "wrongly"
+    assert life("accel-bias", said(200.0, "gyro")).outcome == "wrongly"
     assert life("play", said(200.0, "friction")).outcome == "wrongly"
     assert life("play").outcome == "missed"
 

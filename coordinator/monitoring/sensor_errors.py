@@ -1,0 +1,137 @@
+"""Which sensor explains best what a window shows, if its errors have changed: a rival of payload and link.
+
+A torque sensor has an offset and a scale; a gyro or an accelerometer a bias and a scale on each axis. A
+payload shows in the torques of every joint below it by the lever that it has there, and a displaced link in
+all IMUs beyond it by how its joints turn: only one sensor's error is its own alone. They are judged by the
+same likelihood ratio, with fewer parameters or as many. Where a sensor explains no more than a link or a
+payload, nothing tells them apart, and what happens more often is named: the link or the payload.
+
+The offset of a torque sensor shows in its drive as well, whose motor does not know of it; where a joint turns
+one way more often than the other it passes for friction, now for more and now for less.
+
+What is left out is an error of the axes: an accelerometer that turned is a link that turned.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.monitoring.findings import UNITS, Detection, Kind
+from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined
+from coordinator.monitoring.reference import BaselineTest
+from coordinator.monitoring.residual_tests import (
+    IMU_ERRORS,
+    SENSOR_ERRORS,
+    DriveModel,
+    ImuModel,
+    imu_error_columns,
+)
+from module_agent.model.chain import Array
+
+# By so much more [variances] than a payload or a link a sensor has to explain: chance makes as much of its
+# own parameters once in a thousand windows.
+LEAD = 22.0
+# How large a change of 1 is: of a torque sensor's offset [Nm] and scale; of biases [rad/s, m/s^2] and scales
+# of a sensor of three axes.
+_TORQUE_SIZES = np.array([1.0, 0.3])
+_IMU_SIZES = {"gyro": np.repeat([0.1, 0.1], 3), "accelerometer": np.repeat([1.0, 0.1], 3)}
+# What the model has no error of to begin with is where it was.
+_FIXED = 1e-9
+_PER_UNIT = {"Nm": 1.0, "mrad/s": 1e3, "m/s^2": 1.0}
+
+
+class SensorError(NamedTuple):
+    """By what one sensor has changed; place: of its module; gain: what that explains, in variances.
+
+    error, sigma: its readings' root mean square error in the window and the standard deviation of that, in
+    the kind's unit.
+    """
+
+    kind: Kind
+    place: int
+    gain: float
+    error: float
+    sigma: float
+
+    def detection(self, serial: str, level: float) -> Detection:
+        """Return it as a finding, but for its times."""
+        size = f"{self.error:.2g} +- {self.sigma:.1g} {UNITS[self.kind]} (rms)"
+        summary = f"the {self.kind.replace('-', ' ')} of {serial} reads {size} other than before"
+        return Detection(self.kind, serial, self.error, self.sigma, self.gain, level, summary)
+
+
+def torque_sensor_error(test: BaselineTest, parts: Sequence[Evidence]) -> SensorError:
+    """Return the torque sensor that explains most of a window's evidence (`torque_evidence`)."""
+    later = joined(parts)
+    count = later.parameters - test.evidence.parameters
+    joints = count // SENSOR_ERRORS
+    columns = [np.array([joint, joints + joint]) for joint in range(joints)]
+    changes = _changes(later, test, np.full(count, _FIXED), columns, _TORQUE_SIZES)
+    index = _most(changes)
+    return _sensor_error("torque-sensor", index, changes[index], later, columns[index], _TORQUE_SIZES)
+
+
+def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evidence) -> SensorError:
+    """Return what an offset of a joint's torque sensor explains of its drive's evidence (`drive_window`)."""
+    change = test._replace(changes=(model.offset_change,)).find(later)[0]
+    # Of a change of 1 the offset is the largest element: it has no other.
+    error, sigma = float(change.size[0]), float(np.sqrt(change.covariance[0, 0]))
+    unit_nm = float(model.offset_change.max())
+    return SensorError("torque-sensor", joint, change.gain, unit_nm * abs(error), unit_nm * sigma)
+
+
+def imu_error(test: BaselineTest, model: ImuModel, parts: Sequence[Evidence]) -> SensorError:
+    """Return the gyro or accelerometer that explains most of a window's evidence (`imu_evidence`)."""
+    later, best = joined(parts), []
+    for kind in IMU_ERRORS:
+        sizes = _IMU_SIZES[kind]
+        columns = imu_error_columns(len(model.chain.serials), kind)
+        changes = _changes(later, test, model.own_sigma, columns, sizes)
+        index = _most(changes)
+        best.append(_sensor_error(kind, index, changes[index], later, columns[index], sizes))
+    return max(best, key=lambda one: one.gain)
+
+
+def _changes(
+    later: Evidence, test: BaselineTest, own_sigma: Array, columns: Sequence[Array], sizes: Array
+) -> tuple[Change, ...]:
+    """Return the best change of every sensor, whose errors are in some columns, as `BaselineTest.find`."""
+    own = own_sigma.size
+    matrix, vector = np.zeros_like(later.matrix), np.zeros_like(later.vector)
+    matrix[own:, own:], vector[own:] = test.evidence.matrix, test.evidence.vector
+    hypotheses = []
+    for one in columns:
+        change = np.zeros((later.parameters, len(one)))
+        change[one, np.arange(len(one))] = sizes
+        hypotheses.append(change)
+    whole = test._replace(
+        evidence=Evidence(matrix, vector),
+        prior_sigma=np.concatenate([own_sigma, test.prior_sigma]),
+        changes=tuple(hypotheses),
+    )
+    return whole.find(later)
+
+
+def _most(changes: Sequence[Change]) -> int:
+    return int(np.argmax([change.gain for change in changes]))
+
+
+def _sensor_error(
+    kind: Kind, index: int, change: Change, later: Evidence, columns: Array, sizes: Array
+) -> SensorError:
+    shares = sizes * change.size
+    covariance = sizes[:, None] * change.covariance * sizes
+    # Rows in standard deviations: of the offsets' columns their squares are the samples' weights.
+    seen = later.matrix[np.ix_(columns, columns)]
+    weight = float(np.trace(seen[: len(sizes) // 2, : len(sizes) // 2])) / (len(sizes) // 2)
+    error = float(np.sqrt(max(shares @ seen @ shares / weight, 0.0)))
+    slope = seen @ shares / (weight * max(error, 1e-12))
+    unit = _PER_UNIT[UNITS[kind]]
+    return SensorError(
+        kind,
+        index,
+        change.gain,
+        unit * error,
+        unit * float(np.sqrt(slope @ covariance @ slope)),
+    )

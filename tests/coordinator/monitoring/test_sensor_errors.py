@@ -1,0 +1,218 @@
+"""A sensor that goes off is told from what it might be taken for: a payload, a displaced link, friction."""
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+
+from coordinator.batch_estimation.imu_intrinsics import perfect, read
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
+from coordinator.monitoring.likelihood_ratio import Evidence
+from coordinator.monitoring.reference import BaselineTest
+from coordinator.monitoring.residual_tests import (
+    PRIOR_KG,
+    DriveModel,
+    ImuModel,
+    catalogued_drive,
+    drive_evidence,
+    drive_window,
+    imu_evidence,
+    imu_window,
+    link_changes,
+    payload_changes,
+    torque_evidence,
+    torque_window,
+)
+from coordinator.monitoring.segments import Block, DataSegment
+from coordinator.monitoring.sensor_errors import LEAD, drive_offset, imu_error, torque_sensor_error
+from module_agent.model.catalogue import module_type
+from module_agent.model.chain import Array
+from module_agent.model.imu_prior import IMU_PRIORS
+from module_agent.model.regressor import inverse_dynamics
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain, true_inertia
+
+ROBOT = load_robot("a2085_03")
+CHAIN = true_chain(ROBOT)
+PHI = true_inertia(ROBOT).reshape(-1)
+JOINTS, RATE_HZ = 3, 250.0
+KINDS = [module_type(one.type) for one in ROBOT.modules]
+TORQUE_SIGMA, GYRO_SIGMA, ACCEL_SIGMA = 0.05, 0.01, 0.1
+MODEL = ImuModel(
+    CHAIN,
+    perfect(JOINTS),
+    IMU_PRIORS["calibrated"],
+    np.tile([GYRO_SIGMA] * 3 + [ACCEL_SIGMA] * 3, (JOINTS, 1)),
+)
+
+
+def segments(seed: int, count: int = 10) -> list[DataSegment]:
+    """Return stretches of half a second of motions of all joints, with white noise; the robot is well."""
+    rng = np.random.default_rng(seed)
+    return [_segment(rng) for _ in range(count)]
+
+
+def _segment(rng: Generator) -> DataSegment:
+    t = np.arange(125) / RATE_HZ
+    speed, phase = rng.uniform(4.0, 8.0, JOINTS), rng.uniform(0.0, 6.28, JOINTS)
+    start, swing = rng.uniform(-0.5, 0.5, JOINTS), rng.uniform(0.1, 0.3, JOINTS)
+    angle = t[:, None] * speed + phase
+    q, qd, qdd = (
+        start + swing * np.sin(angle),
+        swing * speed * np.cos(angle),
+        -swing * speed**2 * np.sin(angle),
+    )
+    ideal = readings_on(CHAIN, body_motions(CHAIN, q, qd, qdd))
+    gyro, accel = read(MODEL.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
+    gyro, accel = (
+        gyro + GYRO_SIGMA * rng.normal(size=gyro.shape),
+        accel + ACCEL_SIGMA * rng.normal(size=accel.shape),
+    )
+    tau = inverse_dynamics(CHAIN, PHI, q, qd, qdd)
+    motor = np.stack([kind.gear_ratio * rate for kind, rate in zip(KINDS, qd.T, strict=True)], axis=1)
+    signs = np.sign(qd)
+    drive = np.stack([_current(tau, qd, qdd), np.zeros_like(tau), signs * np.abs(tau), signs, motor], axis=2)
+    drive = np.concatenate([drive, (qdd * motor / np.where(qd, qd, 1.0))[..., None]], axis=2)
+    raw = Block(np.arange(125), q, qd, tau, motor, drive[..., 0], gyro, accel)
+    noisy = tau + TORQUE_SIGMA * rng.normal(size=tau.shape)
+    rates = np.zeros((125, JOINTS, 6))
+    return DataSegment(raw, raw.t_ns, q, qd, qdd, noisy, gyro, accel, rates, drive)
+
+
+def _current(tau: Array, qd: Array, qdd: Array) -> Array:
+    """Return the currents with which the catalogue's motors drive these joints."""
+    columns = []
+    for joint, kind in enumerate(KINDS):
+        c, _, coulomb, viscous, inertia, _ = catalogued_drive(kind)
+        torque = c * tau[:, joint] + coulomb * np.sign(qd[:, joint]) + viscous * qd[:, joint]
+        torque += inertia * qdd[:, joint]
+        columns.append(torque / (kind.gear_ratio * kind.motor.back_emf_v_s_rad * kind.motor.efficiency))
+    return np.stack(columns, axis=1)
+
+
+def torque_parts(parts: list[DataSegment]) -> list[Evidence]:
+    return [torque_evidence(CHAIN, PHI, np.full(JOINTS, TORQUE_SIGMA), one) for one in parts]
+
+
+@pytest.fixture(scope="module")
+def torque_test() -> BaselineTest:
+    known = torque_window(torque_parts(segments(1, 60)))
+    return BaselineTest(known, np.full(PHI.size, PRIOR_KG), payload_changes(JOINTS), 1.0)
+
+
+@pytest.fixture(scope="module")
+def imu_test() -> BaselineTest:
+    known = imu_window(MODEL, [imu_evidence(MODEL, one) for one in segments(1, 60)])
+    return BaselineTest(known, MODEL.prior_sigma, link_changes(CHAIN), 1.0)
+
+
+@pytest.mark.parametrize("joint", range(JOINTS))
+def test_an_offset_of_a_torque_sensor_is_found_at_its_joint_and_measured(
+    torque_test: BaselineTest, joint: int
+) -> None:
+    sick = [one._replace(tau_nm=one.tau_nm + 0.3 * np.eye(JOINTS)[joint]) for one in segments(2)]
+    found = torque_sensor_error(torque_test, torque_parts(sick))
+    best = max(change.gain for change in torque_test.find(torque_window(torque_parts(sick))))
+    assert (found.kind, found.place) == ("torque-sensor", joint)
+    assert found.error == pytest.approx(0.3, abs=4.0 * found.sigma)
+    assert found.sigma < 0.05
+    assert found.gain > best + LEAD
+    assert "the torque sensor of M1 reads" in found.detection("M1", 0.0).summary
+
+
+def test_a_payload_is_not_taken_for_a_torque_sensor(torque_test: BaselineTest) -> None:
+    heavier = PHI.copy()
+    # Half a kilogram at a hand's breadth beyond the last axis.
+    at = CHAIN.point[-1] + [0.1, 0.05, 0.1]
+    heavier[-10:] += 0.5 * np.array([1.0, *at, *_about_root(at)])
+    loaded = []
+    for one in segments(3):
+        more = inverse_dynamics(CHAIN, heavier - PHI, one.q_rad, one.qd_rad_s, one.qdd_rad_s2)
+        loaded.append(one._replace(tau_nm=one.tau_nm + more))
+    window = torque_window(torque_parts(loaded))
+    best = max(change.gain for change in torque_test.find(window))
+    assert torque_sensor_error(torque_test, torque_parts(loaded)).gain < best
+    assert best == pytest.approx(torque_test.misfit(window), rel=0.05)
+
+
+def _about_root(at: Array) -> list[float]:
+    inertia = at @ at * np.eye(3) - np.outer(at, at)
+    return [float(v) for v in inertia[np.triu_indices(3)]]
+
+
+@pytest.mark.parametrize("place", range(JOINTS))
+def test_a_bias_of_an_accelerometer_is_told_from_a_displaced_link(imu_test: BaselineTest, place: int) -> None:
+    bias = 0.8 * np.eye(JOINTS)[place][:, None] * [0.6, 0.0, 0.8]
+    sick = [imu_evidence(MODEL, one._replace(accel_m_s2=one.accel_m_s2 + bias)) for one in segments(4)]
+    found = imu_error(imu_test, MODEL, sick)
+    links = imu_test.find(imu_window(MODEL, sick))
+    assert (found.kind, found.place) == ("accelerometer", place)
+    assert found.gain > max(change.gain for change in links) + LEAD
+    assert found.error == pytest.approx(0.8, abs=max(4.0 * found.sigma, 0.02))
+
+
+def test_a_gyro_with_another_scale_is_named(imu_test: BaselineTest) -> None:
+    scale = 1.0 + 0.05 * np.eye(JOINTS)[1][:, None]
+    sick = [imu_evidence(MODEL, one._replace(gyro_rad_s=one.gyro_rad_s * scale)) for one in segments(5)]
+    found = imu_error(imu_test, MODEL, sick)
+    assert (found.kind, found.place) == ("gyro", 1)
+    spin = np.concatenate([np.linalg.norm(one.gyro_rad_s[::5, 1], axis=1) for one in segments(5)])
+    assert found.error == pytest.approx(50.0 * np.sqrt(np.mean(spin**2)), rel=0.1)
+
+
+def test_a_displaced_link_is_no_imu_that_is_off(imu_test: BaselineTest) -> None:
+    """What is beyond the link moves by 10 mm: all IMUs there are displaced alike."""
+    shift = np.eye(4)
+    shift[:3, 3] = [0.006, 0.008, 0.0]
+    moved = CHAIN._replace(
+        point=CHAIN.point + shift[:3, 3] * [[0.0], [1.0], [1.0]],
+        imu_home=np.stack([CHAIN.imu_home[0], shift @ CHAIN.imu_home[1], shift @ CHAIN.imu_home[2]]),
+    )
+    sick = []
+    for one in segments(6):
+        before, after = (
+            readings_on(chain, body_motions(chain, one.q_rad, one.qd_rad_s, one.qdd_rad_s2))
+            for chain in (CHAIN, moved)
+        )
+        more = after.accel_m_s2 - before.accel_m_s2
+        sick.append(imu_evidence(MODEL, one._replace(accel_m_s2=one.accel_m_s2 + more)))
+    links = imu_test.find(imu_window(MODEL, sick))
+    best = int(np.argmax([change.gain for change in links]))
+    assert CHAIN.linked[best] == 1
+    assert imu_error(imu_test, MODEL, sick).gain < links[best].gain
+
+
+def test_an_offset_shows_in_its_drive_and_friction_does_not_pass_for_it() -> None:
+    kind, joint = KINDS[1], 1
+    model = DriveModel(kind, catalogued_drive(kind), 0.05)
+
+    # Torques are low-passed before they explain a motor's: the noise is that of its current.
+    per_amp = kind.gear_ratio * kind.motor.back_emf_v_s_rad * kind.motor.efficiency
+
+    def window(seed: int, offset_nm: float, more_friction: float) -> Evidence:
+        rng, parts = np.random.default_rng(seed), []
+        for one in segments(seed):
+            drive = one.drive.copy()
+            extra_nm = more_friction * catalogued_drive(kind)[2] * drive[:, joint, 3]
+            drive[:, joint, 0] += (extra_nm + 0.05 * rng.normal(size=len(drive))) / per_amp
+            tau = inverse_dynamics(CHAIN, PHI, one.q_rad, one.qd_rad_s, one.qdd_rad_s2)
+            sick = one._replace(tau_nm=tau + offset_nm * np.eye(JOINTS)[joint], drive=drive)
+            evidence = drive_evidence(model, sick, joint)
+            if evidence is not None:
+                parts.append(evidence)
+        return drive_window(parts)
+
+    test = BaselineTest(window(7, 0.0, 0.0), model.prior_sigma, (model.change,), 1.0)
+    off, stiff = window(8, 0.4, 0.0), window(8, 0.0, 1.0)
+    found = drive_offset(test, model, joint, off)
+    assert found.gain > test.find(off)[0].gain + LEAD
+    assert found.error == pytest.approx(0.4, abs=4.0 * found.sigma)
+    assert drive_offset(test, model, joint, stiff).gain < test.find(stiff)[0].gain
+
+
+def test_a_sensor_that_is_well_explains_no_more_than_chance(
+    torque_test: BaselineTest, imu_test: BaselineTest
+) -> None:
+    """Chi-square of 2 and of 6 degrees of freedom, the largest of 3 and of 6: above 30 once in 10,000."""
+    healthy = segments(9)
+    assert torque_sensor_error(torque_test, torque_parts(healthy)).gain < 30.0
+    assert imu_error(imu_test, MODEL, [imu_evidence(MODEL, one) for one in healthy]).gain < 30.0
