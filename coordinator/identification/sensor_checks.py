@@ -34,6 +34,10 @@ SERIOUS_ABOVE = 8.0
 # What the model leaves unexplained of a gyro or an accelerometer, over what varies in the motions. Links of
 # 100 Nm/rad leave 0.18 and 0.28, an IMU that was exchanged with another in mid session 0.45 and more.
 UNEXPLAINED = 0.35
+# What the model leaves in one motion, over all that varies in it, where it is also more than any drift
+# [rad/s, m/s^2]: what gives moves no more than the motion does, but an IMU exchanged during the session has
+# other biases.
+UNMOVED, DRIFT = 3.0, np.array([0.01, 0.1])
 # Readings that vary by less do not vary: single precision.
 EXACT = 1e-6
 # A joint that was moved alone travels at least this far, and any other less than the share of it.
@@ -287,7 +291,8 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
     """Return the IMUs whose residuals are far beyond their noise, each by the motion where they are most so.
 
     An axis that reads the same all the time, where the model has it vary, is stuck. A sensor much of which is
-    unexplained in all motions together is not that of its module, or reads nonsense.
+    unexplained in all motions together is not that of its module, or reads nonsense; and one that is off in a
+    motion by more than anything moved in it has changed.
 
     Args:
         refined: n modules by k motions.
@@ -298,6 +303,9 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
     # What is left and what is read, by sensor; of what is read the most of any module.
     left, read = (refined.columns**2).sum(axis=-1).swapaxes(0, 1)
     unexplained = np.sqrt(left.sum(axis=1) / np.maximum(read.max(axis=2).sum(axis=1), 1e-12)[:, None])
+    off_at_rest = np.sqrt(left) > np.maximum(
+        UNMOVED * np.sqrt(read.max(axis=2, keepdims=True)), DRIFT[:, None, None]
+    )
     for k, serial in enumerate(refined.chain.serials):
         sensor, motion = divmod(int(ratio[:, :, k].argmax()), len(motions))
         if ratio[sensor, motion, k] > SYSTEMATIC:
@@ -308,7 +316,8 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
             wrong, spread = refined.columns[sensor, :, :, k]
             still = (spread < EXACT).all(axis=0)
             stuck = bool((still & (wrong > SYSTEMATIC * noise[sensor, :, k, None]).any(axis=0)).any())
-            serious = stuck or bool(unexplained[sensor, k] > UNEXPLAINED)
+            changed = bool(off_at_rest[sensor, :, k].any())
+            serious = stuck or changed or bool(unexplained[sensor, k] > UNEXPLAINED)
             findings.append(
                 Finding(
                     serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED, kind, serious

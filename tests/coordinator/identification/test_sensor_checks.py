@@ -145,6 +145,26 @@ def test_an_imu_most_of_which_is_unexplained_is_sick_whatever_gives(
     assert (finding.serial, finding.kind, finding.serious) == ("B", kind, serious)
 
 
+@pytest.mark.parametrize(
+    ("moved", "left", "serious"), [(1e-3, 0.04, True), (1e-3, 0.005, False), (0.03, 0.04, False)]
+)
+def test_an_imu_that_is_off_by_more_than_anything_moves_has_changed(
+    moved: float, left: float, serious: bool
+) -> None:
+    """In a motion that no IMU sees there is nothing that could give; a drift of some mrad/s is usual."""
+    noise = np.stack([np.full((2, 2), 2e-4), np.full((2, 2), 3e-3)])
+    read = np.full((2, 2, 2, 3), 1e-4)
+    read[:, 0, 1], read[0, 1] = 0.5, moved
+    residual = np.full(read.shape, 1e-4)
+    residual[0, 1, 1] = left
+    columns = np.stack([residual, read], axis=1)
+    refined: Any = SimpleNamespace(
+        chain=SimpleNamespace(serials=("A", "B")), residuals=residual.max(axis=-1), columns=columns
+    )
+    (finding,) = misfits(refined, noise, ["the motion of A", "the motion of B"])
+    assert (finding.serial, finding.motion, finding.serious) == ("B", "the motion of B", serious)
+
+
 def test_an_imu_whose_errors_no_make_has_is_named() -> None:
     errors = np.zeros((3, 34))
     # Of calibrated IMUs 0.02 m/s^2 are usual: 7 sigmas may be links that give, 16 are not.
