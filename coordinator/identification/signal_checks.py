@@ -5,11 +5,13 @@ position that jumps between two samples, and a clock that leaps while that of th
 without any model of the robot.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from coordinator.identification.finding import UNUSABLE, Finding, Sickness
 from coordinator.recording.journal import JournalEvent
@@ -23,6 +25,8 @@ from module_agent.wire.feedback_rows import Rows
 # A column that reads the same for this long, and for as many samples, although there is noise. Of a real
 # X5-1's gyro two readings in a row are alike for every second sample: 60 in a row once in 1e18.
 STUCK_S, STUCK_SAMPLES = 0.4, 60
+# So often chance makes as many readings in a row alike where the digits are coarse against the noise.
+ONE_IN = 1e7
 # Noise of a sample [rad/s, m/s^2] above which readings are not exact: a sixth of what a real X5-1's log has.
 NOISY = (1e-4, 1.5e-3)
 # A sensor at the end of its range reads the same extreme this often in a row, this many of its noise's
@@ -113,15 +117,16 @@ def _silent(serial: str) -> Finding:
 
 def _inertial(rows: dict[str, Rows], rests: dict[str, Rows]) -> Iterable[Finding]:
     """Yield stuck and saturated axes of IMUs, if readings at rest have noise, so that equal ones tell."""
-    fresh = {s: one[np.unique(one["imu_t_ns"], return_index=True)[1]] for s, one in rows.items()}
+    fresh, rest = ({s: _fresh(one) for s, one in some.items()} for some in (rows, rests))
     for field, unit, noisy, stuck_kind, saturated_kind in _IMU:
         noise = {s: sample_noise(one[field].astype(float)) for s, one in fresh.items()}
-        resting = [sample_noise(one[field].astype(float)) > noisy for one in rests.values()]
+        resting = [sample_noise(one[field].astype(float)) > noisy for one in rest.values()]
         if not resting or np.mean(resting) < 1.0 / 3.0:
             continue
+        by_chance = chance_repeats([one[field] for one in rest.values()])
         for serial, one in fresh.items():
             step_s = _step_s(one["imu_t_ns"])
-            least = max(STUCK_SAMPLES, round(STUCK_S / step_s) if step_s else STUCK_SAMPLES)
+            least = max(STUCK_SAMPLES, by_chance, round(STUCK_S / step_s) if step_s else 0)
             for axis in range(3):
                 values = one[field][:, axis].astype(float)
                 what = f"{_NAMES[field]} along {'xyz'[axis]}"
@@ -132,6 +137,25 @@ def _inertial(rows: dict[str, Rows], rests: dict[str, Rows]) -> Iterable[Finding
                     yield _at_the_end(serial, what, clipped, values, least_noise, unit, saturated_kind)
                 elif stuck is not None:
                     yield _same_for(serial, what, stuck, step_s, stuck_kind)
+
+
+def _fresh(rows: Rows) -> Rows:
+    """Return the rows in which the IMU's readings are new."""
+    return rows[np.unique(rows["imu_t_ns"], return_index=True)[1]]
+
+
+def chance_repeats(rests: Sequence[Array]) -> int:
+    """Return how many readings in a row chance makes alike once in `ONE_IN`, of sensors at rest (m, 3) each.
+
+    With noise of r digits two readings in a row differ in 2 r / sqrt(pi) of all cases, wherever between two
+    digits the true value is; where it is midway, a reading is another one in erfc(1 / sqrt(8) r) of them
+    only. Axes that never change are left out.
+    """
+    differ = [np.mean(one[1:] != one[:-1], axis=0) for one in rests if len(one) > 1]
+    changing = [share for own in differ for share in own if share > 0.0]
+    digits = float(np.mean(changing)) * np.sqrt(np.pi) / 2.0 if changing else 1.0
+    alike = float(erf(1.0 / (np.sqrt(8.0) * digits)))
+    return math.ceil(min(-np.log(ONE_IN) / np.log(min(alike, 1.0 - 1e-9)), 1e9))
 
 
 def _at_the_end(

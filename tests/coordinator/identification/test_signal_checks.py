@@ -10,6 +10,7 @@ from coordinator.identification.signal_checks import (
     _early_after,
     _inertial,
     _jumps,
+    chance_repeats,
     runs,
     sample_noise,
 )
@@ -20,13 +21,14 @@ from module_agent.wire.feedback_rows import ROW, Rows
 TICK_NS, STEP = 4_000_000, 1.06e-3
 
 
-def rows(count: int = 2000, noise: float = 6e-4, seed: int = 1) -> Rows:
+def rows(count: int = 2000, noise: float = 6e-4, seed: int = 1, bias: float = 0.0) -> Rows:
     """A module at 250 Hz that lies still for a second and then swings; the gyro has steps as real ones do."""
     draw, made = np.random.default_rng(seed), np.zeros(count, ROW)
     made["t_ns"] = made["imu_t_ns"] = TICK_NS * np.arange(count)
     swing = np.clip(np.arange(count) - 250, 0, None) * 4e-3
     made["position_rad"] = np.round(0.3 * np.sin(2.0 * swing) / 1e-4) * 1e-4
     gyro = 0.6 * np.cos(2.0 * swing)[:, None] * [0.0, 0.2, 1.0] * (swing > 0.0)[:, None]
+    gyro = gyro + bias * np.random.default_rng((seed, 1)).uniform(size=3)
     made["gyro_rad_s"] = np.round((gyro + noise * draw.standard_normal((count, 3))) / STEP) * STEP
     made["accel_m_s2"] = [0.0, 0.0, 9.8] + 20.0 * noise * draw.standard_normal((count, 3))
     return made
@@ -39,6 +41,29 @@ def kinds(found: dict[str, Rows]) -> list[tuple[str, str, bool]]:
 
 def test_healthy_imus_with_steps_as_coarse_as_their_noise_are_not_stuck() -> None:
     assert kinds({f"M-{seed}": rows(20_000, seed=seed) for seed in range(4)}) == []
+
+
+@pytest.mark.parametrize("digits", [0.25, 0.3, 0.4])
+def test_an_imu_whose_digits_are_coarser_than_its_noise_is_stuck_only_beyond_chance(digits: float) -> None:
+    """An axis that rests midway between two digits reads the same for hundreds of samples."""
+    slow = {f"M-{seed}": rows(20_000, digits * STEP, seed, STEP) for seed in range(4)}
+    for one in slow.values():
+        one["gyro_rad_s"][:, 0] = np.round(digits * np.random.default_rng(5).standard_normal(20_000)) * STEP
+    assert max(run.length for one in slow.values() for run in runs(one["gyro_rad_s"][:, 0])) > 30
+    assert kinds(slow) == []
+    slow["M-1"]["gyro_rad_s"][9000:, 2] = 0.0
+    assert kinds(slow) == [("M-1", "gyro_stuck", True)]
+
+
+def test_chance_makes_as_many_readings_alike_as_it_is_said_to() -> None:
+    """With noise of a third of a digit, midway between two digits; ten times as often as one in `ONE_IN`."""
+    noise = np.random.default_rng(3).standard_normal((2_000_000, 3)) / 3.0
+    places = np.random.default_rng(4).uniform(size=(40, 3))
+    rests = [np.round(noise[50_000 * k : 50_000 * (k + 1)] + place) for k, place in enumerate(places)]
+    least = chance_repeats(rests)
+    longest = max(run.length for axis in np.round(noise).T for run in runs(axis))
+    # A run of a length comes once in alike^-length: of 6e6 samples it has ln(6e6) / ln(1e7) of that length.
+    assert 0.7 * least < longest < least * 1.1
 
 
 @pytest.mark.parametrize(("field", "kind"), [("gyro_rad_s", "gyro"), ("accel_m_s2", "accelerometer")])
