@@ -31,7 +31,7 @@ RESIDUAL_GIVE = 0.3
 
 
 class NotMoved(DataError):
-    """The joint was commanded to move and hardly did; the message says how much."""
+    """The joint was commanded to move and is not known to have done so; the message says why."""
 
 
 class MotionEvidence(NamedTuple):
@@ -89,12 +89,12 @@ def motion_evidence(
             where that is not known; None if nothing is.
 
     Raises:
-        NotMoved: the joint's rate is below `MIN_RATE_RAD_S` rms.
-        DataError: fewer than `MIN_SAMPLES` samples.
+        NotMoved: the joint's rate is below `MIN_RATE_RAD_S` rms, or there are fewer than `MIN_SAMPLES`
+            samples.
     """
     rate = qd_rad_s[:, joint]
     if rate.size < MIN_SAMPLES:
-        raise DataError(f"{rate.size} samples of the motion; at least {MIN_SAMPLES} are needed")
+        raise NotMoved(f"only {rate.size} samples of its motion are there; {MIN_SAMPLES} are needed")
     size = float(np.sqrt(np.mean(rate**2)))
     if size < MIN_RATE_RAD_S:
         raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {MIN_RATE_RAD_S} is needed")

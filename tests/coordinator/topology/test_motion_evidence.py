@@ -12,7 +12,6 @@ from coordinator.topology.motion_evidence import (
     carried_log_odds,
     motion_evidence,
 )
-from module_agent.model.errors import DataError
 
 SAMPLES, RATE_HZ = 60, 50.0
 AXES = np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -122,7 +121,7 @@ def test_a_joint_that_is_stuck_has_not_moved_whatever_its_encoder_jitters() -> N
 
 def test_too_short_a_motion_is_refused() -> None:
     few = MIN_SAMPLES - 1
-    with pytest.raises(DataError, match=f"{few} samples"):
+    with pytest.raises(NotMoved, match=f"only {few} samples"):
         motion_evidence(0, rates()[:few], np.zeros((few, 3, 3)), np.zeros((3, 3)))
 
 
