@@ -155,7 +155,8 @@ def chance_repeats(rests: Sequence[Array]) -> int:
     changing = [share for own in differ for share in own if share > 0.0]
     digits = float(np.mean(changing)) * np.sqrt(np.pi) / 2.0 if changing else 1.0
     alike = float(erf(1.0 / (np.sqrt(8.0) * digits)))
-    return math.ceil(min(-np.log(ONE_IN) / np.log(min(alike, 1.0 - 1e-9)), 1e9))
+    # Readings that hardly ever change tell nothing by being alike.
+    return math.ceil(-math.log(ONE_IN) / math.log(min(max(alike, 1e-9), 1.0 - 1e-9)))
 
 
 def _at_the_end(
