@@ -89,6 +89,8 @@ class _Cause(NamedTuple):
     since_ns: int = 0
 
 
+# By a sensor that is off nothing is measured.
+_SENSORS: tuple[FindingKind, ...] = ("torque-sensor", "gyro", "accelerometer")
 _AIMS: dict[FindingKind, Aim] = {"wear": "links", "unexplained": "links", "payload": "load"}
 # A displacement that is known worse than that is no reason to move a robot: a limp arm that swings shows it.
 MAX_LINK_SIGMA_MM = 5.0
@@ -115,6 +117,7 @@ class Attendant:
         self._off = False
         self._structure: tuple[str, ...] = ()
         self._lasting: dict[Key, _Cause] = {}
+        self._sick: set[tuple[str, str]] = set()
         # Findings that a measurement did not confirm: until when they are no reason for another.
         self._answered_ns: dict[tuple[str, str], int] = {}
         self._announced: tuple[str, ...] = ()
@@ -248,6 +251,9 @@ class Attendant:
         say = []
         for finding in seen.findings:
             aim, of = _AIMS.get(finding.kind), (finding.kind, finding.serial)
+            if finding.kind in _SENSORS:
+                say += self._sensor(seen.t_ns, finding)
+                continue
             lasting = self._lasting.get(finding.key)
             if lasting is not None:
                 # A link that is not seen any more is no link that is repaired: the robot may only rest.
@@ -264,6 +270,17 @@ class Attendant:
                 self._lasting[finding.key] = _Cause(aim, finding.summary, of, seen.t_ns)
                 say.append(f"it stays so: {finding.summary}")
         return say
+
+    def _sensor(self, t_ns: int, finding: Finding) -> list[str]:
+        """Say once that a sensor is off; what it was taken for is no cause to measure any more."""
+        of = finding.kind, finding.serial
+        if finding.until_ns is not None or of in self._sick or self._structure:
+            return []
+        if not self._lasts(t_ns, finding.detected_ns, self._patience.unexplained_s):
+            return []
+        self._sick.add(of)
+        self._lasting.pop(finding.key, None)
+        return [f"it stays so: {finding.summary}; a measurement would believe it, so that none is made of it"]
 
     def _causes(self) -> list[_Cause]:
         structure = [_Cause("structure", text) for text in self._structure]

@@ -15,7 +15,7 @@ from scipy.special import chdtri
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.contact import Contact
 from coordinator.monitoring.findings import Detection
-from coordinator.monitoring.likelihood_ratio import Change, Evidence
+from coordinator.monitoring.likelihood_ratio import Evidence, most_of
 from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
     UNIT_PAYLOAD_KG,
@@ -176,7 +176,7 @@ def _structure(
         return None
     parts = [segment.imu for segment in window]
     found = reference.imu.find(imu_window(reference.imu_model, parts))
-    most = _most(found)
+    most = most_of(found)
     best, child = found[most], chain.linked[most]
     if best.gain < thresholds.link:
         return None
@@ -204,7 +204,7 @@ def _load(
     parts = [segment.torque for segment in window]
     later = torque_window(parts)
     found = reference.torque.find(later)
-    carrier = _most(found)
+    carrier = most_of(found)
     best = found[carrier]
     if best.gain < thresholds.payload:
         return None
@@ -233,11 +233,6 @@ def _torque_sensor(
 
 def _drive_parts(window: Sequence[SegmentInformation], joint: int) -> list[Evidence]:
     return [rows for segment in window if (rows := segment.drives[joint]) is not None]
-
-
-def _most(changes: Sequence[Change]) -> int:
-    """Return which hypothesis explains most."""
-    return int(np.argmax([change.gain for change in changes]))
 
 
 def explains(reference: Reference, load: LoadShift) -> bool:

@@ -143,6 +143,11 @@ def find_changes(
     return tuple(found)
 
 
+def most_of(changes: Sequence[Change]) -> int:
+    """Return which hypothesis explains most."""
+    return int(np.argmax([change.gain for change in changes]))
+
+
 def misfit_of(before: Evidence, later: Evidence, prior_sigma: ArrayLike) -> float:
     """Return what there is to explain: by how much [variances] two robots fit better than one, each with the
     prior.

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.monitoring.findings import UNITS, Detection, Kind
-from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined
+from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, most_of
 from coordinator.monitoring.reference import BaselineTest
 from coordinator.monitoring.residual_tests import (
     IMU_ERRORS,
@@ -68,17 +68,17 @@ def torque_sensor_error(test: BaselineTest, parts: Sequence[Evidence]) -> Sensor
     joints = count // SENSOR_ERRORS
     columns = [np.array([joint, joints + joint]) for joint in range(joints)]
     changes = _changes(later, test, np.full(count, _FIXED), columns, _TORQUE_SIZES)
-    index = _most(changes)
+    index = most_of(changes)
     return _sensor_error("torque-sensor", index, changes[index], later, columns[index], _TORQUE_SIZES)
 
 
 def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evidence) -> SensorError:
     """Return what an offset of a joint's torque sensor explains of its drive's evidence (`drive_window`)."""
     change = test._replace(changes=(model.offset_change,)).find(later)[0]
-    # Of a change of 1 the offset is the largest element: it has no other.
-    error, sigma = float(change.size[0]), float(np.sqrt(change.covariance[0, 0]))
+    # The hypothesis has one parameter, which moves the offset alone.
     unit_nm = float(model.offset_change.max())
-    return SensorError("torque-sensor", joint, change.gain, unit_nm * abs(error), unit_nm * sigma)
+    error, sigma = abs(float(change.size[0])), float(np.sqrt(change.covariance[0, 0]))
+    return SensorError("torque-sensor", joint, change.gain, unit_nm * error, unit_nm * sigma)
 
 
 def imu_error(test: BaselineTest, model: ImuModel, parts: Sequence[Evidence]) -> SensorError:
@@ -88,7 +88,7 @@ def imu_error(test: BaselineTest, model: ImuModel, parts: Sequence[Evidence]) ->
         sizes = _IMU_SIZES[kind]
         columns = imu_error_columns(len(model.chain.serials), kind)
         changes = _changes(later, test, model.own_sigma, columns, sizes)
-        index = _most(changes)
+        index = most_of(changes)
         best.append(_sensor_error(kind, index, changes[index], later, columns[index], sizes))
     return max(best, key=lambda one: one.gain)
 
@@ -111,10 +111,6 @@ def _changes(
         changes=tuple(hypotheses),
     )
     return whole.find(later)
-
-
-def _most(changes: Sequence[Change]) -> int:
-    return int(np.argmax([change.gain for change in changes]))
 
 
 def _sensor_error(

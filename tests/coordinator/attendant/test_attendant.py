@@ -167,6 +167,28 @@ def test_a_link_that_motions_hardly_show_is_no_reason_to_move() -> None:
     assert not story.said
 
 
+@pytest.mark.parametrize("kind", ["torque-sensor", "gyro", "accelerometer"])
+def test_a_sensor_that_is_off_is_said_once_and_nothing_is_measured_by_it(kind: Kind) -> None:
+    story = Story()
+    story.findings = [found(kind, 0.0)]
+    assert story.goes_on(WAIT.unexplained_s - 1.0) is None
+    assert not story.said
+    assert story.goes_on(300.0) is None
+    assert len(story.heard(f"it stays so: a {kind} at wrist")) == 1
+
+
+def test_a_link_that_turns_out_to_be_an_imu_is_not_measured() -> None:
+    story = Story()
+    story.holders = {"elbow": "painter"}
+    story.findings = [found("wear", 0.0)]
+    story.goes_on(WAIT.link_s + 5.0)
+    assert story.heard("it stays so: a wear at wrist")
+    story.findings = [found("accelerometer", story.now_s)]
+    story.goes_on(WAIT.unexplained_s + 5.0)
+    story.holders = {}
+    assert story.goes_on(300.0) is None
+
+
 @pytest.mark.parametrize("kind", ["collision", "friction"])
 def test_blows_and_stiff_gears_are_no_reason_to_move(kind: Kind) -> None:
     story = Story()
