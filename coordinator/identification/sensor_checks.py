@@ -47,7 +47,9 @@ TRAVEL_RAD, HELD_SHARE = 0.05, 0.3
 LOAD_SIGMA = 0.3
 # Efforts are compared with loads that vary by more than this, and must follow them this closely.
 LOAD_NM, ALIKE_ABOVE = 0.05, 0.8
-_BACKWARDS = "its encoder counts backwards, or the module is mounted the other way round"
+_BACKWARDS = (
+    "its encoder counts backwards, the module is mounted the other way round, or its IMU is another module's"
+)
 EXPLORATION = "its exploration"
 _MISLABELLED = "it seems to be of another type than it reports; its place is estimated"
 _SCALED = "the scale is estimated; check its gear ratio and type"

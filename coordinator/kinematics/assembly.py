@@ -149,7 +149,7 @@ def _check_directions(chain: Chain, observations: ChainObservations) -> None:
         raise AssemblyError(
             f"{observer} saw the axis of joint {joint} {np.degrees(np.arccos(along[worst])):.0f} degrees "
             f"away from where the fit puts it: what {observer} saw of the joints further up does not fit one "
-            "robot. Check the encoders' signs, the topology, and the data of these motions"
+            "robot. Check the encoders' signs, the topology, and whether its IMU was exchanged with another's"
         )
 
 

@@ -145,7 +145,11 @@ def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> 
         pair = (wrong[0].joint, wrong[0].observer)
         reason, pairs = _impossible(serials, observations, pair)
         involved = dict.fromkeys(serial for one in (pair, *pairs) for serial in one)
-        raise TopologyError(f"{reason and reason + ': no tree does that. '}{wrong[0].text}", tuple(involved))
+        raise TopologyError(
+            f"{reason and reason + ': no tree does that. '}{wrong[0].text}; an IMU or an encoder that was "
+            "exchanged with another's looks like this",
+            tuple(involved),
+        )
     open_ = [d for d in topology.doubts if d.kind != "contradiction" and d.log_odds < UNBELIEVABLE_BELOW]
     if open_:
         raise TopologyError(open_[0].text, tuple(dict.fromkeys((open_[0].module, open_[0].joint))))
