@@ -145,6 +145,8 @@ class ModuleGroup:
         answer = await self._persist(
             serial, lambda: self._messenger.ask(serial, leaf, self._request(Ask, serial))
         )
+        if isinstance(answer, Ack) and not answer.accepted:
+            raise NoAnswer(serial, leaf, f"it refuses: {answer.reason}: {answer.detail}")
         if not isinstance(answer, expected):
             raise NoAnswer(serial, leaf, f"its answer is {type(answer).__name__}")
         return answer

@@ -238,9 +238,8 @@ class Session:
         self._known = known
         await self._excluded.meet(sorted(known))
         if not self.group.serials:
-            raise NoModulesFound(
-                f"none of the modules that announced themselves responds: {', '.join(sorted(known))}"
-            )
+            why = "; ".join(self._excluded.why[serial] for serial in sorted(known))
+            raise NoModulesFound(f"none of the modules that announced themselves responds: {why}")
         for serial in self.group.serials:
             self.group.kind(serial)
         self._reporter.note(f"found {len(self.group.serials)}: {', '.join(self.group.serials)}")

@@ -211,7 +211,7 @@ def test_where_no_module_responds_the_session_says_so(arm: Any) -> None:
     arm.run(asyncio.sleep(0.2))
     for serial in arm.serials:
         arm.freeze(serial)
-    with pytest.raises(NoModulesFound, match="none of the modules that announced themselves responds"):
+    with pytest.raises(NoModulesFound, match=r"themselves responds: module .* did not answer on info"):
         explore(arm)
 
 
