@@ -32,6 +32,7 @@ from coordinator.identification.inertia.robot_bodies import robot_bodies
 from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import ANYWHERE_M, refine_checked
 from coordinator.identification.sensor_checks import (
+    changed_since_rest,
     check_encoder_signs,
     check_encoder_travels,
     check_opposed,
@@ -311,6 +312,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
             *doubted,
             *poor_imus(refined, prior),
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
+            *changed_since_rest(refined, rest, recording.rest_rates(topology.serials)),
         )
     except DataError as error:
         raise IdentificationError.of(error) from error

@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.estimator import SYSTEMATIC, Refinement
-from coordinator.batch_estimation.imu_intrinsics import FORCE, error_name
+from coordinator.batch_estimation.estimator import SYSTEMATIC, Refinement, with_placement
+from coordinator.batch_estimation.imu_intrinsics import FORCE, error_name, read
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.finding import Finding, SensorError, Sickness
+from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import STEP_NS
 from coordinator.topology.topology import Observations, Topology
@@ -38,6 +40,9 @@ UNEXPLAINED = 0.35
 # [rad/s, m/s^2]: what gives moves no more than the motion does, but an IMU exchanged during the session has
 # other biases.
 UNMOVED, DRIFT = 3.0, np.array([0.01, 0.1])
+# What an IMU reads at rest differs from the fit of the motions by more than this [rad/s, m/s^2]: drift is
+# less, and so are links that sag.
+CHANGED = (0.01, 1.0)
 # Readings that vary by less do not vary: single precision.
 EXACT = 1e-6
 # A joint that was moved alone travels at least this far, and any other less than the share of it.
@@ -56,6 +61,7 @@ _SCALED = "the scale is estimated; check its gear ratio and type"
 _SENSORS = (("the residual of its gyro", "rad/s"), ("the residual of its accelerometer", "m/s^2"))
 _POOR = "the sensor is sick, or the base or the links give"
 _UNMODELLED = "a link or the base gives more than the model has, or the sensor is sick; the claim is widened"
+_OTHER = "in the motions it was another IMU, or the robot did not rest"
 _OPPOSED = "the sign of its effort or of its encoder is wrong"
 
 
@@ -325,6 +331,35 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
                     serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED, kind, serious
                 )
             )
+    return findings
+
+
+def changed_since_rest(refined: Refinement, rest: RestObservation, gyro_rad_s: Array) -> list[Finding]:
+    """Return the IMUs that read at rest what those of the motions would not: they are others.
+
+    An IMU exchanged for another one between rest and motion may fit another robot in all motions, but its
+    biases are its own.
+
+    Args:
+        refined: of the motions.
+        rest: mean readings, and gyro_rad_s (n, 3) those of the gyros.
+    """
+    chain, still = with_placement(refined.chain, refined.placement), np.zeros((1, len(rest.q_rad)))
+    ideal = readings_on(chain, body_motions(chain, rest.q_rad[None], still, still))
+    expected = read(refined.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
+    findings = []
+    for k, serial in enumerate(refined.chain.serials):
+        for sensor, measured in enumerate((gyro_rad_s[k], rest.specific_force_m_s2[k])):
+            off = measured - expected[sensor][0, k]
+            size, worst = float(np.linalg.norm(off)), int(np.abs(off).argmax())
+            if size <= CHANGED[sensor]:
+                continue
+            name, unit = ("gyro", "rad/s") if sensor == 0 else ("accelerometer", "m/s^2")
+            kind: Sickness = "accelerometer_contradicts" if sensor else "gyro_contradicts"
+            what = f"what its {name} reads along {'xyz'[worst]}"
+            read_there = float(measured[worst]), float(expected[sensor][0, k, worst])
+            away = NAMED_ABOVE * size / CHANGED[sensor]
+            findings.append(Finding(serial, "its rest", what, *read_there, away, unit, _OTHER, kind, True))
     return findings
 
 

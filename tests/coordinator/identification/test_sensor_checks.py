@@ -6,13 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.batch_estimation.imu_intrinsics import ACCEL_BIAS, FORCE, ImuIntrinsics, error_name
+from coordinator.batch_estimation.imu_intrinsics import (
+    ACCEL_BIAS,
+    FORCE,
+    GYRO_BIAS,
+    ImuIntrinsics,
+    error_name,
+)
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.finding import SensorError
 from coordinator.identification.robot_refinement import sick_imus
 from coordinator.identification.sensor_checks import (
     Travel,
+    changed_since_rest,
     check_encoder_signs,
     check_encoder_travels,
     check_opposed,
@@ -21,12 +29,15 @@ from coordinator.identification.sensor_checks import (
     misfits,
     poor_imus,
 )
+from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.topology.topology import MotionObservation
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
 
 
 def _seen(robots: Any, chain: Chain, sign: Array) -> dict[tuple[str, str], MotionObservation]:
@@ -163,6 +174,47 @@ def test_an_imu_that_is_off_by_more_than_anything_moves_has_changed(
     )
     (finding,) = misfits(refined, noise, ["the motion of A", "the motion of B"])
     assert (finding.serial, finding.motion, finding.serious) == ("B", "the motion of B", serious)
+
+
+REST_Q = np.array([0.1, -0.4, 0.7])
+BIASES = np.array([[0.02, -0.01, 0.0], [-0.03, 0.01, 0.02], [0.0, 0.0, 0.01]])
+
+
+def at_rest() -> tuple[Any, RestObservation, np.ndarray]:
+    """Return the fit of an arm, and what its IMUs read at rest."""
+    chain, errors = true_chain(load_robot("a2085_03")), np.zeros((3, 34))
+    errors[:, GYRO_BIAS] = BIASES
+    refined = SimpleNamespace(chain=chain, placement=np.zeros((3, 6)), intrinsics=ImuIntrinsics(errors))
+    still = np.zeros((1, 3))
+    force = readings_on(chain, body_motions(chain, REST_Q[None], still, still)).accel_m_s2[0]
+    return refined, RestObservation(force, 1e-3, REST_Q), BIASES.copy()
+
+
+def test_imus_that_read_at_rest_what_the_motions_say_have_not_changed() -> None:
+    refined, rest, gyro = at_rest()
+    drift = rest._replace(specific_force_m_s2=rest.specific_force_m_s2 + 0.3)
+    assert changed_since_rest(refined, rest, gyro) == []
+    assert changed_since_rest(refined, drift, gyro + 0.005) == []
+
+
+def test_imus_exchanged_between_rest_and_motion_are_named_by_their_biases() -> None:
+    """Two IMUs that hang alike, exchanged: gravity is where it was, and all motions fit another robot."""
+    refined, rest, gyro = at_rest()
+    found = changed_since_rest(refined, rest, gyro[[1, 0, 2]])
+    assert [(one.serial, one.kind, one.serious) for one in found] == [
+        (serial, "gyro_contradicts", True) for serial in refined.chain.serials[:2]
+    ]
+    assert found[0].measured == pytest.approx(-0.03)
+    assert found[0].expected == pytest.approx(0.02)
+    assert found[0].summary.endswith("in the motions it was another IMU, or the robot did not rest")
+
+
+def test_an_imu_that_hangs_otherwise_at_rest_is_named_by_gravity() -> None:
+    refined, rest, gyro = at_rest()
+    force = rest.specific_force_m_s2.copy()
+    force[2] = -force[2]
+    (found,) = changed_since_rest(refined, rest._replace(specific_force_m_s2=force), gyro)
+    assert (found.serial, found.kind) == (refined.chain.serials[2], "accelerometer_contradicts")
 
 
 def test_an_imu_whose_errors_no_make_has_is_named() -> None:
