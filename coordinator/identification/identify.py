@@ -312,7 +312,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
             *doubted,
             *poor_imus(refined, prior),
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
-            *changed_since_rest(refined, rest, recording.rest_rates(topology.serials)),
+            *changed_since_rest(refined, rest.q_rad, [recording.rest_rows(s) for s in topology.serials]),
         )
     except DataError as error:
         raise IdentificationError.of(error) from error

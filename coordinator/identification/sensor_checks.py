@@ -16,7 +16,6 @@ from coordinator.batch_estimation.imu_prediction import body_motions, readings_o
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.finding import Finding, SensorError, Sickness
-from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import STEP_NS
 from coordinator.topology.topology import Observations, Topology
@@ -26,6 +25,7 @@ from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import JointMotion
+from module_agent.wire.feedback_rows import Rows
 
 # Sigma of a direction in the frame of an IMU as delivered: axes turned by 1 deg, 20 mg, joints that give way.
 DIRECTION_SIGMA_RAD = 0.05
@@ -43,6 +43,12 @@ UNMOVED, DRIFT = 3.0, np.array([0.01, 0.1])
 # What an IMU reads at rest differs from the fit of the motions by more than this [rad/s, m/s^2]: drift is
 # less, and so are links that sag.
 CHANGED = (0.01, 1.0)
+# The mean of a second of an arm that swings is this share of its readings' scatter at the most.
+SWINGS = 0.3
+_AT_REST: tuple[tuple[str, str, str, Sickness], ...] = (
+    ("gyro_rad_s", "its gyro", "rad/s", "gyro_contradicts"),
+    ("accel_m_s2", "its accelerometer", "m/s^2", "accelerometer_contradicts"),
+)
 # Readings that vary by less do not vary: single precision.
 EXACT = 1e-6
 # A joint that was moved alone travels at least this far, and any other less than the share of it.
@@ -334,32 +340,33 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
     return findings
 
 
-def changed_since_rest(refined: Refinement, rest: RestObservation, gyro_rad_s: Array) -> list[Finding]:
+def changed_since_rest(refined: Refinement, q_rad: Array, rests: Sequence[Rows]) -> list[Finding]:
     """Return the IMUs that read at rest what those of the motions would not: they are others.
 
     An IMU exchanged for another one between rest and motion may fit another robot in all motions, but its
-    biases are its own.
+    biases are its own. An arm that still swings when it should rest is none that has changed.
 
     Args:
         refined: of the motions.
-        rest: mean readings, and gyro_rad_s (n, 3) those of the gyros.
+        q_rad: (n,) the joints' mean positions at rest. rests: the rows of every module then.
     """
-    chain, still = with_placement(refined.chain, refined.placement), np.zeros((1, len(rest.q_rad)))
-    ideal = readings_on(chain, body_motions(chain, rest.q_rad[None], still, still))
+    chain, still = with_placement(refined.chain, refined.placement), np.zeros((1, len(q_rad)))
+    ideal = readings_on(chain, body_motions(chain, q_rad[None], still, still))
     expected = read(refined.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
     findings = []
-    for k, serial in enumerate(refined.chain.serials):
-        for sensor, measured in enumerate((gyro_rad_s[k], rest.specific_force_m_s2[k])):
-            off = measured - expected[sensor][0, k]
+    for k, (serial, rows) in enumerate(zip(refined.chain.serials, rests, strict=True)):
+        for sensor, (field, name, unit, kind) in enumerate(_AT_REST):
+            readings = rows[field].astype(float)
+            off = readings.mean(axis=0) - expected[sensor][0, k]
             size, worst = float(np.linalg.norm(off)), int(np.abs(off).argmax())
-            if size <= CHANGED[sensor]:
-                continue
-            name, unit = ("gyro", "rad/s") if sensor == 0 else ("accelerometer", "m/s^2")
-            kind: Sickness = "accelerometer_contradicts" if sensor else "gyro_contradicts"
-            what = f"what its {name} reads along {'xyz'[worst]}"
-            read_there = float(measured[worst]), float(expected[sensor][0, k, worst])
-            away = NAMED_ABOVE * size / CHANGED[sensor]
-            findings.append(Finding(serial, "its rest", what, *read_there, away, unit, _OTHER, kind, True))
+            allowed = max(CHANGED[sensor], SWINGS * float(np.linalg.norm(readings.std(axis=0))))
+            if size > allowed:
+                what = f"what {name} reads along {'xyz'[worst]}"
+                wanted = float(expected[sensor][0, k, worst])
+                there, away = wanted + float(off[worst]), NAMED_ABOVE * size / allowed
+                findings.append(
+                    Finding(serial, "its rest", what, there, wanted, away, unit, _OTHER, kind, True)
+                )
     return findings
 
 

@@ -403,10 +403,6 @@ class Recording:
         position = np.array([float(resting["position_rad"].mean()) for resting in rows])
         return RestObservation(force, max(scatter), position)
 
-    def rest_rates(self, serials: Sequence[str]) -> NDArray[np.float64]:
-        """Return the mean of what every gyro read in its module's last rest, (n, 3) [rad/s]."""
-        return np.array([self.rest_rows(s)["gyro_rad_s"].astype(float).mean(axis=0) for s in serials])
-
     def module_type(self, serial: str) -> ModuleType:
         """Return a module's type, as it reported it.
 

@@ -29,13 +29,13 @@ from coordinator.identification.sensor_checks import (
     misfits,
     poor_imus,
 )
-from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.topology.topology import MotionObservation
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
+from module_agent.wire.feedback_rows import ROW, Rows
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 
@@ -180,40 +180,55 @@ REST_Q = np.array([0.1, -0.4, 0.7])
 BIASES = np.array([[0.02, -0.01, 0.0], [-0.03, 0.01, 0.02], [0.0, 0.0, 0.01]])
 
 
-def at_rest() -> tuple[Any, RestObservation, np.ndarray]:
-    """Return the fit of an arm, and what its IMUs read at rest."""
+def at_rest() -> tuple[Any, list[Rows]]:
+    """Return the fit of an arm, and what its IMUs read in a second of rest."""
     chain, errors = true_chain(load_robot("a2085_03")), np.zeros((3, 34))
     errors[:, GYRO_BIAS] = BIASES
     refined = SimpleNamespace(chain=chain, placement=np.zeros((3, 6)), intrinsics=ImuIntrinsics(errors))
-    still = np.zeros((1, 3))
+    still, rng = np.zeros((1, 3)), np.random.default_rng(1)
     force = readings_on(chain, body_motions(chain, REST_Q[None], still, still)).accel_m_s2[0]
-    return refined, RestObservation(force, 1e-3, REST_Q), BIASES.copy()
+    rests = [np.zeros(250, ROW) for _ in range(3)]
+    for k, rows in enumerate(rests):
+        rows["gyro_rad_s"] = BIASES[k] + 1e-3 * rng.normal(size=(250, 3))
+        rows["accel_m_s2"] = force[k] + 0.02 * rng.normal(size=(250, 3))
+    return refined, rests
 
 
 def test_imus_that_read_at_rest_what_the_motions_say_have_not_changed() -> None:
-    refined, rest, gyro = at_rest()
-    drift = rest._replace(specific_force_m_s2=rest.specific_force_m_s2 + 0.3)
-    assert changed_since_rest(refined, rest, gyro) == []
-    assert changed_since_rest(refined, drift, gyro + 0.005) == []
+    refined, rests = at_rest()
+    assert changed_since_rest(refined, REST_Q, rests) == []
+    for rows in rests:
+        rows["gyro_rad_s"] += 0.005
+        rows["accel_m_s2"] += 0.3
+    assert changed_since_rest(refined, REST_Q, rests) == []
 
 
-def test_imus_exchanged_between_rest_and_motion_are_named_by_their_biases() -> None:
+def test_an_arm_that_still_swings_when_it_should_rest_has_no_other_imus() -> None:
+    refined, rests = at_rest()
+    for rows in rests:
+        # Of 3.3 swings a second the last third of one is left.
+        rows["gyro_rad_s"][:, 2] += 0.2 * np.sin(2.0 * np.pi * 3.3 * np.arange(250) / 250.0)
+    assert changed_since_rest(refined, REST_Q, rests) == []
+
+
+@pytest.mark.parametrize("since", [0, 90])
+def test_imus_exchanged_after_or_during_the_rest_are_named_by_their_biases(since: int) -> None:
     """Two IMUs that hang alike, exchanged: gravity is where it was, and all motions fit another robot."""
-    refined, rest, gyro = at_rest()
-    found = changed_since_rest(refined, rest, gyro[[1, 0, 2]])
+    refined, (first, second, third) = at_rest()
+    gyros = first["gyro_rad_s"].copy(), second["gyro_rad_s"].copy()
+    first["gyro_rad_s"][since:], second["gyro_rad_s"][since:] = gyros[1][since:], gyros[0][since:]
+    found = changed_since_rest(refined, REST_Q, [first, second, third])
     assert [(one.serial, one.kind, one.serious) for one in found] == [
         (serial, "gyro_contradicts", True) for serial in refined.chain.serials[:2]
     ]
-    assert found[0].measured == pytest.approx(-0.03)
     assert found[0].expected == pytest.approx(0.02)
     assert found[0].summary.endswith("in the motions it was another IMU, or the robot did not rest")
 
 
 def test_an_imu_that_hangs_otherwise_at_rest_is_named_by_gravity() -> None:
-    refined, rest, gyro = at_rest()
-    force = rest.specific_force_m_s2.copy()
-    force[2] = -force[2]
-    (found,) = changed_since_rest(refined, rest._replace(specific_force_m_s2=force), gyro)
+    refined, rests = at_rest()
+    rests[2]["accel_m_s2"] *= -1.0
+    (found,) = changed_since_rest(refined, REST_Q, rests)
     assert (found.serial, found.kind) == (refined.chain.serials[2], "accelerometer_contradicts")
 
 
