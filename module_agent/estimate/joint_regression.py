@@ -190,7 +190,7 @@ def _minimise(problem: _Problem, state: _State) -> tuple[_State, Array]:
         at = _equations(problem, state, noise)
         step = np.asarray(np.linalg.solve(at.normal, at.gradient), dtype=np.float64)
         state, noise = _moved(state, step), at.noise
-        if np.all(np.abs(step) <= SETTLED / np.sqrt(np.diag(at.normal))):
+        if np.all(np.abs(step) * np.sqrt(np.diag(at.normal)) <= SETTLED):
             break
     end = _equations(problem, state, noise)
     inverse = np.linalg.inv(end.normal)
