@@ -15,7 +15,7 @@ A change of 2 or 3 begins the notice anew. Without leave to move it ends at 1, w
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from coordinator.monitoring.findings import Finding, Key
+from coordinator.monitoring.findings import SENSORS, Finding, Key
 from coordinator.monitoring.findings import Kind as FindingKind
 
 Aim = Literal["structure", "links", "load"]
@@ -89,8 +89,6 @@ class _Cause(NamedTuple):
     since_ns: int = 0
 
 
-# By a sensor that is off nothing is measured.
-_SENSORS: tuple[FindingKind, ...] = ("torque-sensor", "gyro", "accelerometer")
 _AIMS: dict[FindingKind, Aim] = {"wear": "links", "unexplained": "links", "payload": "load"}
 # A displacement that is known worse than that is no reason to move a robot: a limp arm that swings shows it.
 MAX_LINK_SIGMA_MM = 5.0
@@ -251,7 +249,7 @@ class Attendant:
         say = []
         for finding in seen.findings:
             aim, of = _AIMS.get(finding.kind), (finding.kind, finding.serial)
-            if finding.kind in _SENSORS:
+            if finding.kind in SENSORS:
                 say += self._sensor(seen.t_ns, finding)
                 continue
             lasting = self._lasting.get(finding.key)

@@ -22,6 +22,8 @@ UNITS: dict[Kind, str] = {
     "gyro": "mrad/s",
     "accelerometer": "m/s^2",
 }
+# A sensor of a module that reads other than it did.
+SENSORS: tuple[Kind, ...] = ("torque-sensor", "gyro", "accelerometer")
 # What IMUs show, of which one at a time holds; torques have the rest.
 STRUCTURAL: tuple[Kind, ...] = ("wear", "gyro", "accelerometer")
 KINDS = tuple(UNITS)
