@@ -46,7 +46,7 @@ LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
 MOVING_RAD_S = 0.02
 # Friction changes by more than that with the weather.
 MIN_FRICTION = 0.1
-# A payload leaves no more of the misfit than chance does in one window of so many.
+# A change that is all there is leaves no more of the misfit than chance does in one window of so many.
 ONE_IN = 1e4
 # A mass that is not known to this many standard deviations is not said to be there.
 MIN_SIGMAS = 5.0
@@ -152,7 +152,9 @@ def _drives(
         if change.gain > thresholds.drive and abs(more) > MIN_FRICTION + 3.0 * sigma:
             serial = reference.chain.serials[joint]
             offset = drive_offset(known, model, joint, later)
-            if offset.gain > change.gain + LEAD:
+            if offset.gain > change.gain + LEAD and _is_all(
+                offset.gain, known.misfit(later), len(model.theta)
+            ):
                 found.append(offset.detection(serial, thresholds.drive))
                 continue
             summary = (
@@ -209,26 +211,32 @@ def _load(
     if best.gain < thresholds.payload:
         return None
     change = UNIT_PAYLOAD_KG * parameter_scale(1) * best.size
-    left = reference.torque.misfit(later) - best.gain
-    return LoadShift(
-        carrier, best.gain, left, change, _torque_sensor(reference, thresholds, window, best.gain)
-    )
+    misfit = reference.torque.misfit(later)
+    sensor = _torque_sensor(reference, thresholds, window, best.gain, misfit)
+    return LoadShift(carrier, best.gain, misfit - best.gain, change, sensor)
 
 
 def _torque_sensor(
-    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], gain: float
+    reference: Reference,
+    thresholds: Thresholds,
+    window: Sequence[SegmentInformation],
+    gain: float,
+    misfit: float,
 ) -> Detection | None:
-    """Return the torque sensor that explains more than a payload of some gain, or whose drive shows it."""
+    """Return the torque sensor that explains all of a misfit and more than a payload of some gain does, or
+    whose drive shows it."""
     rival = torque_sensor_error(reference.torque, [segment.torque for segment in window])
     joint = rival.place
     found = rival.detection(reference.chain.serials[joint], thresholds.payload)
-    if rival.gain > gain + LEAD:
+    if rival.gain > gain + LEAD and _is_all(rival.gain, misfit, _load_freedom(reference)):
         return found
     known, parts = reference.drives[joint], _drive_parts(window, joint)
     if known is None or not parts:
         return None
-    offset = drive_offset(known, reference.drive_models[joint], joint, drive_window(parts))
-    return found if offset.gain > thresholds.drive else None
+    model, later = reference.drive_models[joint], drive_window(parts)
+    offset = drive_offset(known, model, joint, later)
+    shown = offset.gain > thresholds.drive and _is_all(offset.gain, known.misfit(later), len(model.theta))
+    return found if shown else None
 
 
 def _drive_parts(window: Sequence[SegmentInformation], joint: int) -> list[Evidence]:
@@ -237,8 +245,19 @@ def _drive_parts(window: Sequence[SegmentInformation], joint: int) -> list[Evide
 
 def explains(reference: Reference, load: LoadShift) -> bool:
     """Return whether a payload on one body is all that has changed of the torques."""
-    freedom = PER_BODY * max(len(reference.chain.serials) - 1, 1)
-    return load.left < float(chdtri(freedom, 1.0 / ONE_IN)) + 0.1 * load.gain
+    return _is_all(load.gain, load.gain + load.left, _load_freedom(reference))
+
+
+def _load_freedom(reference: Reference) -> int:
+    return PER_BODY * max(len(reference.chain.serials) - 1, 1)
+
+
+def _is_all(gain: float, misfit: float, freedom: int) -> bool:
+    """Return whether what a change explains of a misfit leaves no more than chance and a tenth of itself.
+
+    A window that begins before a change mixes two robots, and a wrong change may fit the mixture better.
+    """
+    return misfit - gain < float(chdtri(freedom, 1.0 / ONE_IN)) + 0.1 * gain
 
 
 def weighed(
