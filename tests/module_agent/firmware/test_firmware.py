@@ -755,6 +755,26 @@ def test_a_clock_that_goes_back_expires_the_command_and_the_lease_at_once(back_m
     assert [o.leaf for o in bench.published].count(Leaf.FEEDBACK) >= 2
 
 
+@pytest.mark.parametrize(("jump_ms", "state"), [(125, "moving"), (126, "expired"), (240, "expired")])
+def test_a_clock_that_jumps_by_over_half_the_lifetime_expires_the_command_at_once(
+    jump_ms: int, state: str
+) -> None:
+    """Else the target would leap by as much of the motion; the lease is not over, as its holder lives."""
+    bench = Bench()
+    bench.acquire(duration_ns=10_000 * MS)
+    bench.move()
+    bench.ticks(200)
+    bench.renew()
+    bench.tick()
+    bench.now += (jump_ms - 1) * MS
+    bench.tick()
+    assert bench.firmware.state == state
+    assert (bench.pwm == 0.0) == (state == "expired")
+    assert bench.firmware.lease.holder is not None
+    if state == "expired":
+        assert bench.status().note.startswith(f"{jump_ms} ms without a tick: the clock jumped")
+
+
 def test_a_holder_cannot_command_what_no_module_should_do() -> None:
     bench = Bench()
     bench.acquire()

@@ -222,7 +222,7 @@ ACTIONS = st.one_of(
     st.tuples(st.just("hot"), st.integers(0, 2), st.floats(100.0, 160.0)),
     st.tuples(st.just("fast"), st.integers(0, 2), st.floats(-2.0, 2.0)),
     st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([-24.0, 0.0, 12.0, 24.0, 48.0])),
-    st.tuples(st.just("clock"), st.integers(0, 2), st.sampled_from([-700, -1, 3, 300])),
+    st.tuples(st.just("clock"), st.integers(0, 2), st.sampled_from([-700, -1, 3, 130, 300])),
 )
 
 SIDES = st.sampled_from(["disabled", "motor_off", "hold", "spring"])
@@ -387,6 +387,10 @@ STEPS: list[tuple[Any, ...]] = [
     ("ticks", 60),
     ("clock", 2, -700),
     *(("acquire", k) for k in range(3)),
+    ("ticks", 20),
+    ("clock", 0, 130),
+    ("ticks", 3),
+    ("acquire", 0),
     ("ask", 0),
     ("ticks", 500),
 ]
