@@ -122,7 +122,13 @@ def sampling_notes(
         except DataError:
             continue  # It is raised again where the rows are needed.
         for what, t_ns in (("joint", track.t_ns), ("IMU", track.imu_t_ns)):
-            rate_hz = NS_PER_S / float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+            interval_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else float(NS_PER_S)
+            if interval_ns == 0.0:
+                raise DataError(
+                    f"{serial}: over half of the samples of its {what} in {motion} have the time of the one "
+                    "before: its clock stood still"
+                )
+            rate_hz = NS_PER_S / interval_ns
             if rate_hz < FEWEST * cutoff_hz:
                 raise DataError(
                     f"{serial}: its {what} has {rate_hz:.1f} samples per second in {motion}; a low-pass of "

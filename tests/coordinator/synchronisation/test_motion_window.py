@@ -169,6 +169,21 @@ def test_rates_too_low_for_the_low_pass_are_named(wire: SimpleNamespace) -> None
         sampling_notes(recording, CLOCKS, SERIALS, [event], 84.0)
 
 
+def test_a_clock_that_stands_still_for_most_of_a_motion_is_named(
+    wire: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def standing(serial: str) -> np.ndarray:
+        rows = whole(serial)
+        if serial == "B":
+            rows["t_ns"][350:900], rows["imu_t_ns"][350:900] = rows["t_ns"][350], rows["imu_t_ns"][350]
+        return rows
+
+    whole = _rows
+    monkeypatch.setattr(f"{__name__}._rows", standing)
+    with pytest.raises(DataError, match=r"^B: over half of the samples of its joint .* clock stood still"):
+        sampling_notes(_recording(wire), CLOCKS, SERIALS, [_event(wire)], 12.0)
+
+
 def test_a_module_without_any_row_in_the_motion_is_named(wire: SimpleNamespace) -> None:
     with pytest.raises(DataError, match="module C has no row"):
         window(_recording(wire, {"C": (300, 1100)}), CLOCKS, SERIALS, _event(wire))
