@@ -23,10 +23,15 @@ UNITS: dict[Kind, str] = {
     "accelerometer": "m/s^2",
 }
 # A sensor of a module that reads other than it did.
-SENSORS: tuple[Kind, ...] = ("torque-sensor", "gyro", "accelerometer")
+IMU_SENSORS: tuple[Kind, ...] = ("gyro", "accelerometer")
+SENSORS: tuple[Kind, ...] = ("torque-sensor", *IMU_SENSORS)
 # What IMUs show, of which one at a time holds; torques have the rest.
-STRUCTURAL: tuple[Kind, ...] = ("wear", "gyro", "accelerometer")
+STRUCTURAL: tuple[Kind, ...] = ("wear", *IMU_SENSORS)
 KINDS = tuple(UNITS)
+
+Key = tuple[str, str | int]
+# The key of the one finding that IMUs show.
+STRUCTURE: Key = ("structure", 0)
 
 
 class Finding(BaseModel):
@@ -58,11 +63,11 @@ class Finding(BaseModel):
     summary: str
 
     @property
-    def key(self) -> tuple[str, str | int]:
+    def key(self) -> Key:
         """What makes it the same finding as an earlier one: a later word on it replaces the earlier."""
         if self.kind in ("collision", "friction"):
             return self.kind, self.since_ns if self.kind == "collision" else self.serial
-        return "structure" if self.kind in STRUCTURAL else "load", 0
+        return STRUCTURE if self.kind in STRUCTURAL else ("load", 0)
 
 
 class Detection(NamedTuple):
@@ -82,10 +87,9 @@ class Detection(NamedTuple):
         return Finding.model_validate(self._asdict() | times | {"unit": UNITS[self.kind]})
 
 
-Key = tuple[str, str | int]
-
-# A size is said again when it moved by more than this share of itself, and by more than two sigmas.
-REPORTED_CHANGE = 0.1
+# A size is said again when it moved by more than this share of itself, and by more than two sigmas; by how
+# much a sensor is off depends on what it happens to measure.
+REPORTED_CHANGE, REPORTED_SENSOR_CHANGE = 0.1, 1.0
 # A change that no window has shown for so long is over: longer than the longest window.
 OVER_NS = 8_000_000_000
 
@@ -151,5 +155,6 @@ def _news(reported: Finding | None, finding: Finding) -> bool:
         return True
     if (reported.until_ns is None) != (finding.until_ns is None):
         return True
-    least = max(REPORTED_CHANGE * abs(reported.size), 2.0 * reported.sigma)
+    share = REPORTED_SENSOR_CHANGE if finding.kind in SENSORS else REPORTED_CHANGE
+    least = max(share * abs(reported.size), 2.0 * reported.sigma)
     return finding.kind != "collision" and abs(finding.size - reported.size) > least

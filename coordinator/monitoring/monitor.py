@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from coordinator.monitoring.contact import CollisionDetector, Contact
 from coordinator.monitoring.diagnosis import (
     Diagnosis,
@@ -19,9 +21,9 @@ from coordinator.monitoring.diagnosis import (
     unexplained,
     weighed,
 )
-from coordinator.monitoring.findings import STRUCTURAL, Finding, FindingLog, Key
+from coordinator.monitoring.findings import IMU_SENSORS, STRUCTURAL, STRUCTURE, Finding, FindingLog, Key
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, SPANS, Reference, Thresholds, thresholds
-from coordinator.monitoring.segments import Alignment, Block, Gap, Segmenter
+from coordinator.monitoring.segments import SEGMENT_S, Alignment, Block, DataSegment, Gap, Segmenter
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array
@@ -37,6 +39,8 @@ BEFORE_NS, AFTER_NS = 200_000_000, 300_000_000
 # With clocks of a larger standard deviation, samples of different instants would be compared: at 1 rad/s and
 # 0.35 m a millisecond is 0.35 mm of a link, and 0.6 % of a torque that swings at 1 Hz.
 WORST_CLOCK_NS = 1e6
+# An encoder leaps that shows more than so many times the largest speed of its type.
+LEAP = 3.0
 # A change began with a contact, if there was one so shortly before it was first seen.
 BEGAN_WITHIN_NS = 4_000_000_000
 # A change is called by what explains it after so many stretches in a row; if nothing does, after more.
@@ -104,29 +108,35 @@ class Monitor:
             notes += self._hindered(aligned.gaps, aligned.silent)
             notes += self._timed(clocks)
             if aligned.block is not None:
-                found, dropped = self._look(aligned.block)
+                found, dropped, said = self._look(aligned.block)
                 findings += found
                 withdrawn += dropped
+                notes += said
             if not aligned.gaps:
                 # A block ends with the newest rows.
                 break
         return MonitorUpdate(tuple(findings), tuple(withdrawn), tuple(notes))
 
-    def _look(self, block: Block) -> tuple[list[Finding], list[Key]]:
+    def _look(self, block: Block) -> tuple[list[Finding], list[Key], list[str]]:
         now_ns = int(block.t_ns[-1])
         findings: list[Finding] = []
         withdrawn: list[Key] = []
+        notes: list[str] = []
         self.monitored_s += len(block.t_ns) / RATE_HZ
         for contact in self._collisions.advance(block):
             if not self._untimed:
                 detection = collision(self.reference, self.thresholds, contact)
                 findings += self.finding_log.put(detection.finding(contact.start_ns, now_ns, contact.end_ns))
         for segment in self._segmenter.add(block):
+            if leaps := self._leaps(segment):
+                notes += leaps
+                continue
             self._pieces.append(segment_information(self.reference, segment))
             diagnosed = self._diagnosed()
             findings += self._drives(diagnosed, now_ns)
             if self._untimed:
                 continue
+            findings += self._sick_imu(diagnosed, now_ns)
             hypothesis = self._hypothesis(diagnosed)
             if hypothesis is not None:
                 findings += self._change(hypothesis, now_ns)
@@ -134,7 +144,22 @@ class Monitor:
             if hypothesis is not None:
                 withdrawn += self._adapted(hypothesis, now_ns)
             findings += self._ended(now_ns)
-        return findings, withdrawn
+        return findings, withdrawn, notes
+
+    def _leaps(self, segment: DataSegment) -> list[str]:
+        """Note the encoders that leap in a segment: no motion of the robot makes such rows."""
+        notes = []
+        fastest = np.abs(segment.qd_rad_s).max(axis=0)
+        for serial, model, speed in zip(
+            self.reference.chain.serials, self.reference.drive_models, fastest, strict=True
+        ):
+            most = LEAP * model.kind.max_speed_rad_s
+            if speed > most:
+                notes.append(
+                    f"module {serial}: its encoder leaps, by {speed:.3g} rad/s where its type has at most "
+                    f"{model.kind.max_speed_rad_s:.3g}; {SEGMENT_S:g} s are left out"
+                )
+        return notes
 
     def _held(self, *kinds: str) -> bool:
         return any(finding.kind in kinds for finding in self.finding_log.held.values())
@@ -164,11 +189,25 @@ class Monitor:
         credible = [one for one in latest.values() if one.kind == "torque-sensor" or one.serial not in sick]
         return [news for finding in credible for news in self.finding_log.put(finding)]
 
+    def _is_sick_imu(self, one: Diagnosis) -> bool:
+        """Return whether what IMUs show is the sick one that is held: it says nothing of torques."""
+        held, seen = self.finding_log.held.get(STRUCTURE), one.structure
+        if held is None or seen is None or held.kind not in IMU_SENSORS:
+            return False
+        return (held.kind, held.serial) == (seen.kind, seen.serial)
+
+    def _sick_imu(self, diagnosed: _Diagnosed, now_ns: int) -> list[Finding]:
+        """Go on with the sick IMU that is held, by the longest window that shows it."""
+        shown = [one.structure for one, _ in diagnosed if self._is_sick_imu(one)]
+        return (
+            [] if not shown or shown[-1] is None else self.finding_log.put(shown[-1].finding(now_ns, now_ns))
+        )
+
     def _hypothesis(self, diagnosed: _Diagnosed) -> _Hypothesis | None:
         """Return what explains the newest windows; those since the change began come first."""
         found, serials = None, self.reference.chain.serials
         for one, window in reversed(diagnosed):
-            if one.structure is not None:
+            if one.structure is not None and not self._is_sick_imu(one):
                 found = _Hypothesis(one.structure.kind, one.structure.serial, one, window)
                 break
             if found is not None or one.load is None:
@@ -204,7 +243,7 @@ class Monitor:
         kind, log = hypothesis.kind, self.finding_log
         if self._agreed_for < (UNEXPLAINED_AFTER if kind == "unexplained" else CONFIRMED):
             return []
-        if kind not in STRUCTURAL and self._held(*STRUCTURAL):
+        if kind not in STRUCTURAL and self._held("wear"):
             return []
         # By a torque sensor that is off nothing can be weighed.
         if kind in ("payload", "unexplained") and self._held("torque-sensor"):
@@ -244,15 +283,17 @@ class Monitor:
         )
 
     def _withdrawn(self, findings: Sequence[Finding], now_ns: int) -> list[Key]:
-        """Withdraw what a change explains: loads if a link or an IMU is off, friction if the joint's torque
-        sensor is, contacts of its beginning."""
+        """Withdraw what a change explains: loads if a link is off, friction if the joint's torque sensor is,
+        contacts of its beginning if torques have changed."""
         lasting = [f for f in findings if f.kind not in ("collision", "friction")]
-        structural = any(f.kind in STRUCTURAL for f in lasting)
-        withdrawn = self.finding_log.withdraw([("load", 0)] if structural else [])
+        displaced = any(f.kind == "wear" for f in lasting)
+        withdrawn = self.finding_log.withdraw([("load", 0)] if displaced else [])
         withdrawn += self.finding_log.withdraw(
             ("friction", f.serial) for f in lasting if f.kind == "torque-sensor"
         )
         for change in lasting:
+            if change.kind in IMU_SENSORS:
+                continue
             withdrawn += self._without_collisions(change.since_ns, now_ns)
         return withdrawn
 

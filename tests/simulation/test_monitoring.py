@@ -1,9 +1,13 @@
 """Events on a known arm that moves are named, located and sized by the monitor; there is nothing else."""
 
+from typing import Any
+
+import numpy as np
 import pytest
 
 from coordinator.monitoring.findings import Finding
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
+from coordinator.monitoring.segments import Aligned, Alignment
 from sim.benchmark.cases.monitored_robot import WorldEvent, monitor_robot
 from sim.benchmark.cases.monitoring import (
     Happens,
@@ -13,6 +17,9 @@ from sim.benchmark.cases.monitoring import (
     monitoring_trial,
     settings_of,
 )
+from sim.geometry.link_parts import FreePose
+from sim.imperfections.ageing import Ageing
+from sim.robot.variants import loaded
 from sim.world.external_force import Push
 
 # Tests of this group share recorded runs: they stay in one process.
@@ -66,6 +73,60 @@ def test_a_link_that_slipped_is_no_payload_as_imus_see_it_too() -> None:
     assert trial.located
     # Also by the length along an axis that these seconds hardly show.
     assert trial.size_error == pytest.approx(0.0, abs=0.33 * trial.size)
+
+
+def test_a_weight_is_weighed_though_a_gyro_is_off() -> None:
+    """Torques need no IMU: the gyro goes on being named, and later the weight is."""
+    known = known_subject(ARM)
+    monitor = Monitor(known.reference)
+    last = known.robot.serials[-1]
+    weight = FreePose(mass_kg=0.25, com_xyz_m=(0.03, 0.02, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
+    heavier = loaded(known.robot, last, weight)
+    events = (
+        WorldEvent(4.0, lambda world: world.age(last, Ageing(gyro_scale=0.06))),
+        WorldEvent(12.0, lambda world: world.become(heavier)),
+    )
+    said: list[Finding] = []
+
+    def report(update: MonitorUpdate, now_ns: int) -> None:
+        said.extend(update.findings)
+
+    monitor_robot(settings_of(known.robot, ARM, 5), known.motions, 20.0, monitor, report, events)
+    held = {finding.kind: finding for finding in monitor.finding_log.held.values()}
+    assert set(held) == {"gyro", "payload"}, monitor.finding_log.all
+    assert {finding.serial for finding in held.values()} == {last}
+    assert held["payload"].size == pytest.approx(0.25, rel=0.1)
+    # By how much it is off depends on the motion: that is no news every second.
+    assert len([finding for finding in said if finding.kind == "gyro"]) <= 4
+
+
+@pytest.mark.parametrize("leap_rad", [1.0, 500.0])
+def test_an_encoder_that_leaps_is_said_and_what_it_shows_is_left_out(
+    leap_rad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The low-pass makes a huge speed of it, by which no torque can be predicted."""
+    known = known_subject(ARM)
+    monitor = Monitor(known.reference)
+    advance = Alignment.advance
+
+    def leaping(self: Alignment, *what: Any) -> Aligned:
+        aligned = advance(self, *what)
+        if aligned.block is None:
+            return aligned
+        q_rad = np.array(aligned.block.q_rad)
+        q_rad[aligned.block.t_ns >= 4_000_000_000, 1] += leap_rad
+        return aligned._replace(block=aligned.block._replace(q_rad=q_rad))
+
+    monkeypatch.setattr(Alignment, "advance", leaping)
+    notes: list[str] = []
+
+    def report(update: MonitorUpdate, now_ns: int) -> None:
+        notes.extend(update.notes)
+
+    monitor_robot(settings_of(known.robot, ARM, 5), known.motions, 5.0, monitor, report)
+    said = [note for note in notes if "its encoder leaps" in note]
+    assert said
+    assert all(known.robot.serials[1] in note for note in said)
 
 
 def test_a_hand_that_holds_the_arm_for_seconds_is_not_weighed() -> None:
