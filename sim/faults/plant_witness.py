@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from module_agent.control.safety import UNCONFIGURED
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
 from module_agent.model.catalogue import module_type
 from module_agent.wire.codec import decode
@@ -32,6 +33,9 @@ SPEED_MARGIN = 1.25
 # How far a motor may drive its joint on beyond a limit of its position: what the encoder errs by, and a joint
 # that is led back against its load is let down and pushed again. The way that braking takes is no driving.
 OUTWARD_RAD = 0.02
+# How much warmer than its limit a winding is that drives: the sensor errs by less [K]. A module that hangs
+# does not look; its motor is off after its lifetime.
+HEAT_K, HEAT_TICKS = 3.0, LIFETIME_NS // TICK_NS + 2
 # Ticks between looks at the motors' speeds, which change within tens of milliseconds.
 SPEED_TICKS = 8
 # A PWM at 48 V; no command of a module may be larger.
@@ -69,6 +73,8 @@ class PlantWitness:
         self._ranges = ranges
         # How far each joint has been driven on since it left its range.
         self._outward_rad = dict.fromkeys(ranges, 0.0)
+        # For how many ticks each motor has been driven that is too hot.
+        self._hot_ticks: dict[str, int] = {}
         self._sent_ns: dict[str, int] = {}
         self._accepted_ns: dict[str, int] = {}
         self._stopped: set[str] = set()
@@ -136,6 +142,7 @@ class PlantWitness:
             looked_ns = first_ns + first_look * TICK_NS
             self._check_speeds(robot, looked_ns, seen[first_look::SPEED_TICKS, PLANT_MOTOR_RAD_S])
         self._check_positions(robot.serials, first_ns, seen)
+        self._check_heat(robot, seen[:, PLANT_PWM])
         for k, serial in enumerate(robot.serials):
             commanded_ns = min(
                 self._sent_ns.get(serial, -LIFETIME_NS), self._accepted_ns.get(serial, -LIFETIME_NS)
@@ -169,6 +176,21 @@ class PlantWitness:
         at_s = (first_ns + (tick * SPEED_TICKS + 1) * TICK_NS) / 1e9
         text = f"module {robot.serials[k]} at {at_s:.3f} s: {speeds[tick, k]:.2f} rad/s of {limits[k]:.2f}"
         self._note("speed beyond the limit", text)
+
+    def _check_heat(self, robot: VirtualRobot, pwm: Array) -> None:
+        """Judge motors that were driven in all of some ticks, (T, n), and are too hot at their end."""
+        winding_c, driven = robot.world.winding_c, (pwm != 0.0).all(axis=0)
+        for k in np.flatnonzero(~driven | (winding_c < UNCONFIGURED.winding_c + HEAT_K)):
+            self._hot_ticks.pop(robot.serials[k], None)
+        for k in np.flatnonzero(driven & (winding_c >= UNCONFIGURED.winding_c + HEAT_K)):
+            serial = robot.serials[k]
+            self._hot_ticks[serial] = ticks = self._hot_ticks.get(serial, 0) + len(pwm)
+            if ticks > HEAT_TICKS:
+                text = (
+                    f"module {serial} at {robot.world.t_ns / NS_PER_S:.3f} s: driven for {ticks} ticks at "
+                    f"{winding_c[k]:.0f} C of {UNCONFIGURED.winding_c:.0f} C"
+                )
+                self._note("driven too hot", text)
 
     def _check_positions(self, serials: Sequence[str], first_ns: int, seen: Array) -> None:
         """Judge where the motors drive their joints, in the ticks (T, rows, n).

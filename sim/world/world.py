@@ -163,6 +163,12 @@ class World:
         return read_only(total)
 
     @property
+    def winding_c(self) -> Array:
+        """The true temperatures of the motors' windings (n,) [degrees Celsius]."""
+        heat = self._windings.arrays
+        return read_only(heat.above_k[0] + heat.ambient_c)
+
+    @property
     def plant(self) -> Plant:
         """The true state at the instant of the last samples; at the start before the first tick."""
         t_ns = max(self._tick - 1, 0) * TICK_NS

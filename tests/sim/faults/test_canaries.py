@@ -38,11 +38,13 @@ CORRUPTED = 10
 RECKLESS = 68
 # Something holds a motor while its joint is to move, and lets it go.
 HELD = 39
+# A motor is too hot while the session begins.
+HOT = 125
 # Some messages arrive twice, which changes nothing.
 HARMLESS = 102
 
 
-@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS])
+@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS, HOT])
 def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
     assert found(seed) == {}
 
@@ -95,6 +97,18 @@ def test_a_guard_that_does_not_bound_the_speed_lets_a_motor_be_too_fast(
 ) -> None:
     monkeypatch.setattr("module_agent.hardware.motor_guard.OVERSPEED", 10.0)
     assert set(found(HELD)) == {"speed beyond the limit"}
+
+
+def test_a_module_that_does_not_mind_its_winding_drives_it_too_hot(monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds_of, enter, finish = motor_guard.bounds_of, Firmware._enter, Firmware._finish_motion
+    monkeypatch.setattr(motor_guard, "bounds_of", lambda *of: bounds_of(*of)._replace(ceiling_c=1e9))
+    monkeypatch.setattr(
+        Firmware, "_enter", lambda own, trigger, note="": trigger == "fault" or enter(own, trigger, note)
+    )
+    monkeypatch.setattr(
+        Firmware, "_finish_motion", lambda own, outcome: outcome == "fault" or finish(own, outcome)
+    )
+    assert "driven too hot" in found(HOT)
 
 
 def test_an_agent_that_dies_of_a_message_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:

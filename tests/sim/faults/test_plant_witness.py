@@ -24,6 +24,7 @@ class Scene:
     def __init__(self) -> None:
         self.witness = PlantWitness({HOLDER: HOLDER}, {SERIAL: (-1.0, 0.5)})
         self.now_ns = self._seq = 0
+        self.winding_c = 40.0
 
     def accept(self, leaf: Leaf, action: Literal["acquire", "renew"] | None = None) -> None:
         """Let the coordinator ask for something which the module grants."""
@@ -60,7 +61,7 @@ class Scene:
         """Return what the witness notes of ticks (T, rows, 1) of the motor from a time on."""
         robot: Any = SimpleNamespace(
             serials=(SERIAL,),
-            world=SimpleNamespace(t_ns=from_ns + len(seen) * MS),
+            world=SimpleNamespace(t_ns=from_ns + len(seen) * MS, winding_c=np.array([self.winding_c])),
             robot=SimpleNamespace(modules=[SimpleNamespace(type="X5-9")]),
         )
         self.witness.check(robot, seen)
@@ -157,3 +158,17 @@ def test_the_way_beyond_a_range_counts_from_call_to_call_and_begins_anew_within(
         assert scene.looked(outside(0.0, 0.0, 0.4, ticks=1), scene.now_ns) == set()
     assert scene.looked(outside(0.3, 1.0, 0.6, ticks=16), scene.now_ns) == set()
     assert scene.looked(outside(0.3, 1.0, 0.616, ticks=16), scene.now_ns) == {"driven beyond its range"}
+
+
+def test_no_motor_is_driven_for_longer_than_a_lifetime_while_its_winding_is_too_hot() -> None:
+    """Off for one tick, or cooler, and it begins anew; 154 degrees are the limit, and 157 are seen."""
+    seen = np.zeros((84, SEEN_ROWS, 1))
+    seen[:, PLANT_PWM], seen[:, ASKED] = 0.3, 0.3
+    off = np.zeros((1, SEEN_ROWS, 1))
+    hot, warm = armed(), armed()
+    hot.winding_c, warm.winding_c = 158.0, 156.0
+    for scene in (hot, warm):
+        for ticks in (seen, seen, seen, off, seen, seen, seen):
+            assert scene.looked(ticks, scene.now_ns) == set()
+    assert hot.looked(seen[:1], hot.now_ns) == {"driven too hot"}
+    assert warm.looked(seen[:1], warm.now_ns) == set()
