@@ -258,15 +258,16 @@ class Client:
                 return
             match event:
                 case Sample(at, payload):
-                    self._hear(parse(at).serial, parse(at).leaf, payload)
+                    self._hear(at, payload)
                 case Liveness(at, alive):
                     self.alive[parse(at).serial] = alive
                 case Reply():
                     self._replies[event.tag] = event
 
-    def _hear(self, serial: str, leaf: Leaf, payload: bytes) -> None:
+    def _hear(self, at: str, payload: bytes) -> None:
         try:
-            self._note(serial, leaf, payload)
+            parts = parse(at)
+            self._note(parts.serial, parts.leaf, payload)
         except WireError:
             self.unreadable += 1
 

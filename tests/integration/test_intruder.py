@@ -12,18 +12,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from coordinator.live_robot.authority import make_credentials
 from coordinator.recording.run_folder import SESSION, load_recording
-from module_agent.model.errors import EXIT_USAGE
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE
 from module_agent.transport.credentials import COORDINATOR, OBSERVER, host_credentials, load_credentials
 from module_agent.transport.transport import NoHub, Request
 from module_agent.transport.zenoh_transport import ZenohConfig, ZenohTransport, open_zenoh
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, key
-from module_agent.wire.messages import Feedback, LeaseRequest, Setpoint, Status
+from module_agent.wire.messages import Ack, Feedback, LeaseRequest, Setpoint, Status, Stop
 from module_agent.wire.refusal import WireError
+from sim.faults.intruder import Intruder
 from sim.faults.invariants import RESOLUTION_MM, SIGMAS
 from sim.scoring.score import score
 from sim.world.truth import read_motion
@@ -92,25 +94,89 @@ def attack(intruder, serial: str, status: Status, holder_ns: int, number: int) -
 
 
 def test_what_is_published_lets_nobody_act_in_the_holders_name(launcher, client, programs) -> None:
-    """Without any security: the lease's secret is known to the holder and the module only."""
+    """Without any security: the lease's secret is known to the holder and the module only.
+
+    Nor does a program end of statuses of a module that cannot be, and of motions of 2^62 rows.
+    """
     robot = launcher(ROBOT)
     robot.start_world()
     coordinator = robot.start_coordinator(quiet=True)
     agents = robot.start_agents()
     intruder = client(ROBOT)
     serial = robot.config.serials[0]
+    poisoner = Intruder(intruder.transport, ROBOT, serial, 0, 1)
     intruder.motion(serial, "windowed_sine", 20, coordinator)
     for number in range(40):
+        poisoner.poison()
         intruder.pump()
         attack(intruder, serial, intruder.statuses[serial][-1], intruder.newest_ns[serial], number)
     refused = intruder.until(
         lambda: intruder.statuses[serial][-1].refusals.get("unproven", 0) >= 80, "refusals", *agents
     )
     assert refused
+    assert all(agent.process.poll() is None for agent in agents)
     code, text = programs.ended(coordinator)
     assert code == 0, text
     robot.stop()
     assert score(robot.config.out).topology_correct
+
+
+def answer_stops(session: zenoh.Session, statuses: dict[str, list[Status]]) -> list[str]:
+    """Answer every stop in the module's place, as a queryable that calls itself complete.
+
+    Returns the serials of those that were answered.
+    """
+    answered: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            stop = decode(Stop, query.payload.to_bytes())
+            latest = statuses[stop.serial][-1]
+            ack = Ack(
+                serial=stop.serial,
+                boot=latest.boot,
+                seq=1_000_000,
+                re=stop.seq,
+                accepted=True,
+                reason="",
+                detail="",
+                t_ns=latest.t_ns,
+                holder=None,
+                lease_left_ns=0,
+                token=0,
+            )
+            query.reply(query.key_expr, encode(ack))
+            answered.append(stop.serial)
+
+    session.declare_queryable(f"x5/{ROBOT}/*/stop", answer, complete=True)
+    return answered
+
+
+def test_a_stop_reaches_the_modules_past_one_who_answers_in_their_place(
+    launcher, client, programs, endpoint
+) -> None:
+    """Without any security: whose answer comes first is nobody's to say, but the motors are stopped."""
+    robot = launcher(ROBOT)
+    robot.start_world()
+    coordinator = robot.start_coordinator(["--dynamics"], quiet=True)
+    agents = robot.start_agents()
+    ear = client(ROBOT)
+    ear.motion(robot.config.serials[0], "windowed_sine", 50, coordinator)
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    with zenoh.open(config) as impostor:
+        answered = answer_stops(impostor, ear.statuses)
+        programs.run("coordinator.main", "stop", *at(endpoint))
+        code, said = programs.ended(coordinator)
+    assert answered
+    assert code == EXIT_FAILED
+    assert "was stopped by" in said
+    ear.close()
+    witness = client(ROBOT, hub=True)
+    witness.meet(robot.config.serials, *agents)
+    for serial in robot.config.serials:
+        assert witness.status(serial).state == "stopped"
 
 
 class Forger:
