@@ -247,6 +247,10 @@ class Attendant:
     def _findings(self, seen: Observation) -> list[str]:
         """Take over what the monitor has found for long enough."""
         say = []
+        # One that is well again, or is another, may be off once more.
+        self._sick &= {
+            (finding.kind, finding.serial) for finding in seen.findings if finding.until_ns is None
+        }
         for finding in seen.findings:
             aim, of = _AIMS.get(finding.kind), (finding.kind, finding.serial)
             if finding.kind in SENSORS:
@@ -270,7 +274,10 @@ class Attendant:
         return say
 
     def _sensor(self, t_ns: int, finding: Finding) -> list[str]:
-        """Say once that a sensor is off; what it was taken for is no cause to measure any more."""
+        """Say once that a sensor is off, and again after it was well.
+
+        What it was taken for is no cause to measure any more.
+        """
         of = finding.kind, finding.serial
         if finding.until_ns is not None or of in self._sick or self._structure:
             return []

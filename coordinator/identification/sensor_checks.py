@@ -317,7 +317,7 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
     # What is left and what is read, by sensor; of what is read the most of any module.
     left, read = (refined.columns**2).sum(axis=-1).swapaxes(0, 1)
     unexplained = np.sqrt(left.sum(axis=1) / np.maximum(read.max(axis=2).sum(axis=1), 1e-12)[:, None])
-    off_at_rest = np.sqrt(left) > np.maximum(
+    off_unmoved = np.sqrt(left) > np.maximum(
         UNMOVED * np.sqrt(read.max(axis=2, keepdims=True)), DRIFT[:, None, None]
     )
     for k, serial in enumerate(refined.chain.serials):
@@ -330,7 +330,7 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
             wrong, spread = refined.columns[sensor, :, :, k]
             still = (spread < EXACT).all(axis=0)
             stuck = bool((still & (wrong > SYSTEMATIC * noise[sensor, :, k, None]).any(axis=0)).any())
-            changed = bool(off_at_rest[sensor, :, k].any())
+            changed = bool(off_unmoved[sensor, :, k].any())
             serious = stuck or changed or bool(unexplained[sensor, k] > UNEXPLAINED)
             findings.append(
                 Finding(

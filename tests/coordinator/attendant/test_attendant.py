@@ -175,6 +175,12 @@ def test_a_sensor_that_is_off_is_said_once_and_nothing_is_measured_by_it(kind: K
     assert not story.said
     assert story.goes_on(300.0) is None
     assert len(story.heard(f"it stays so: a {kind} at wrist")) == 1
+    # It is changed for another one, which is off in its turn.
+    story.findings = [story.findings[0].model_copy(update={"until_ns": round(story.now_s * 1e9)})]
+    story.goes_on(100.0)
+    story.findings = [*story.findings, found(kind, story.now_s)]
+    story.goes_on(WAIT.unexplained_s + 100.0)
+    assert len(story.heard(f"it stays so: a {kind} at wrist")) == 2
 
 
 def test_a_link_that_turns_out_to_be_an_imu_is_not_measured() -> None:

@@ -221,6 +221,26 @@ def test_a_question_to_an_agent_that_has_just_died_names_the_module_as_lost(
     rig.run(work())
 
 
+def test_a_question_that_a_module_refuses_is_answered_with_its_reason(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM)
+    messenger, _, group = rig.group()
+
+    async def refuse(serial: str, leaf: Leaf, message: Message, *how: Any) -> Ack:
+        head = {"serial": serial, "boot": 1, "seq": 1, "re": message.seq, "t_ns": 1}
+        why = {"accepted": False, "reason": "wrong_serial", "detail": "this is Y"}
+        return Ack.model_validate(head | why | {"holder": None, "lease_left_ns": 0, "token": 0})
+
+    async def work() -> None:
+        await _met(group)
+        monkeypatch.setattr(messenger, "ask", refuse)
+        with pytest.raises(NoAnswer, match=f"{TIP}.*it refuses: wrong_serial: this is Y"):
+            await group.ask_status(TIP)
+
+    rig.run(work())
+
+
 def test_a_frozen_agent_is_noticed_by_its_missing_feedback(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     _, _, group = rig.group()

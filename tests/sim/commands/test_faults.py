@@ -71,6 +71,31 @@ def test_seeds_without_violation_end_with_zero() -> None:
     assert "1 seeds, 0 with violations" in found.output
 
 
+def test_a_dask_cluster_finds_what_this_process_finds(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    document = tmp_path / "faults.json"
+    with distributed.LocalCluster(host="127.0.0.1", protocol="tcp", **options) as cluster:
+        found = CliRunner().invoke(
+            app,
+            [
+                "faults",
+                "--seeds",
+                "94..95",
+                "--no-shrink",
+                "--dask",
+                cluster.scheduler_address,
+                "--json",
+                str(document),
+            ],
+        )
+    assert found.exit_code == 0, found.output
+    reports = json.loads(document.read_text())["reports"]
+    assert [one["seed"] for one in reports] == [94, 95]
+    here = [run_seed(draw(seed), shrinks=False) for seed in (94, 95)]
+    assert [(one["outcome"], one["text"]) for one in reports] == [(one.outcome, one.text) for one in here]
+
+
 @pytest.mark.usefixtures("in_this_process")
 def test_seeds_that_are_over_are_kept_and_not_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
