@@ -155,10 +155,11 @@ class Firmware:
         self._now_ns = now_ns
         if now_ns <= before_ns and before_ns > 0:
             self._begin_time_anew(before_ns)
-        elif self.state in COMMANDED and now_ns - before_ns > self.config.lifetime_ns // 2:
+        elif self.state in COMMANDED and 2 * (now_ns - before_ns) > self.config.lifetime_ns:
             self._expire()
-            passed_ms = (now_ns - before_ns) / 1e6
-            self._note = f"{passed_ms:.0f} ms without a tick: the clock jumped, or the module stood still"
+            self._note = (
+                f"no tick for {(now_ns - before_ns) / 1e6:.0f} ms: the clock jumped, or the module hung"
+            )
         if self.state in COMMANDED and now_ns - self._fresh_ns > self.config.lifetime_ns:
             self._expire()
         if self.lease.lapsed(now_ns):

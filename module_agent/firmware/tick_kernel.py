@@ -143,7 +143,7 @@ def _is_quiet(own: Any, now_ns: int, before_ns: int, reading: Floats, most: Floa
     if now_ns <= before_ns or now_ns >= own.lease_until_ns or now_ns >= own.status_due_ns:
         return False
     if own.commanded and (
-        now_ns - own.fresh_ns > own.lifetime_ns or now_ns - before_ns > own.lifetime_ns // 2
+        now_ns - own.fresh_ns > own.lifetime_ns or 2 * (now_ns - before_ns) > own.lifetime_ns
     ):
         return False
     if own.source == MOTION and now_ns >= own.motion_end_ns:
