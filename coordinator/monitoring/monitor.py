@@ -198,10 +198,10 @@ class Monitor:
 
     def _sick_imu(self, diagnosed: _Diagnosed, now_ns: int) -> list[Finding]:
         """Go on with the sick IMU that is held, by the longest window that shows it."""
-        shown = [one.structure for one, _ in diagnosed if self._is_sick_imu(one)]
-        return (
-            [] if not shown or shown[-1] is None else self.finding_log.put(shown[-1].finding(now_ns, now_ns))
-        )
+        for one, _ in reversed(diagnosed):
+            if one.structure is not None and self._is_sick_imu(one):
+                return self.finding_log.put(one.structure.finding(now_ns, now_ns))
+        return []
 
     def _hypothesis(self, diagnosed: _Diagnosed) -> _Hypothesis | None:
         """Return what explains the newest windows; those since the change began come first."""

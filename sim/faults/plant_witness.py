@@ -179,12 +179,14 @@ class PlantWitness:
 
     def _check_heat(self, robot: VirtualRobot, pwm: Array) -> None:
         """Judge motors that were driven in all of some ticks, (T, n), and are too hot at their end."""
-        winding_c, driven = robot.world.winding_c, (pwm != 0.0).all(axis=0)
-        for k in np.flatnonzero(~driven | (winding_c < UNCONFIGURED.winding_c + HEAT_K)):
-            self._hot_ticks.pop(robot.serials[k], None)
-        for k in np.flatnonzero(driven & (winding_c >= UNCONFIGURED.winding_c + HEAT_K)):
+        winding_c = robot.world.winding_c
+        too_hot = (pwm != 0.0).all(axis=0) & (winding_c >= UNCONFIGURED.winding_c + HEAT_K)
+        if not (self._hot_ticks or too_hot.any()):
+            return
+        before, self._hot_ticks = self._hot_ticks, {}
+        for k in np.flatnonzero(too_hot):
             serial = robot.serials[k]
-            self._hot_ticks[serial] = ticks = self._hot_ticks.get(serial, 0) + len(pwm)
+            self._hot_ticks[serial] = ticks = before.get(serial, 0) + len(pwm)
             if ticks > HEAT_TICKS:
                 text = (
                     f"module {serial} at {robot.world.t_ns / NS_PER_S:.3f} s: driven for {ticks} ticks at "
