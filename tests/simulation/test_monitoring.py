@@ -68,6 +68,11 @@ def test_stiff_gears_are_no_torque_sensor_that_is_off() -> None:
     assert trial.false_alarms == 0, trial.words
 
 
+def test_a_weak_blow_is_no_torque_sensor_that_is_off() -> None:
+    """Too weak to be detected as one, it passes for a sensor in a short window and in no long one."""
+    assert monitoring_trial("collision", 8, Subject()).words == ()
+
+
 def test_a_link_that_slipped_is_no_payload_as_imus_see_it_too() -> None:
     trial = tried("wear")
     assert trial.located
