@@ -42,7 +42,8 @@ class Kinematics(NamedTuple):
 
     findings: sensors that contradict the catalogue or the others. measured: earlier recordings of some of the
     modules, from which the refinement took the prior of their IMUs. excluded: modules without which the robot
-    is identified, as their sensors are sick. damage: sentences on what cannot be read of the recording.
+    is identified, as their sensors are sick. missing: sentences on modules that were absent or at fault,
+    or observed no motion. damage: sentences on what cannot be read of the recording.
     """
 
     topology: Topology
@@ -53,6 +54,7 @@ class Kinematics(NamedTuple):
     findings: tuple[Finding, ...] = ()
     measured: tuple[CalibrationInformation, ...] = ()
     excluded: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
 
     @property
@@ -64,7 +66,7 @@ class Kinematics(NamedTuple):
     @property
     def suspicions(self) -> list[str]:
         """Why the robot is not to be believed as usual, as sentences; none of healthy robots."""
-        return [*(one.summary for one in self.findings if one.serious), *self.damage]
+        return [*(one.summary for one in self.findings if one.serious), *self.missing, *self.damage]
 
     @property
     def fit(self) -> ChainEstimate:

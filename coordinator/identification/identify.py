@@ -50,7 +50,7 @@ from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, joint_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
-from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
+from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules, missing_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
 from coordinator.synchronisation.motion_windows import (
@@ -260,6 +260,7 @@ def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
         clocks=clocks,
         notes=tuple(dict.fromkeys((*kept.notes, *sampling))),
         findings=(*kept.findings, *later_findings),
+        missing=tuple(dict.fromkeys((*kept.missing, *missing_modules(recording.journal)))),
         damage=tuple(recording.damage),
     )
 
@@ -326,7 +327,9 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         if estimate.note
     )
     notes += (*search.notes, *sampling, *_imu_outliers(topology.serials, refined, prior))
-    return Kinematics(topology, first, refined, clocks, notes, findings, tuple(measured))
+    return Kinematics(
+        topology, first, refined, clocks, notes, findings, tuple(measured), missing=search.missing
+    )
 
 
 def _imu_outliers(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:

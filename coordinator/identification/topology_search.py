@@ -11,7 +11,7 @@ from coordinator.identification.topology_observations import (
     slow_motions,
 )
 from coordinator.kinematics.simultaneous_motion import motion_observations
-from coordinator.recording.journal import exclusion_notes
+from coordinator.recording.journal import exclusion_notes, missing_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.next_motion import NextMotion, next_motions
@@ -28,11 +28,15 @@ from module_agent.model.errors import DataError
 
 
 class TopologyFound(NamedTuple):
-    """The topology of the modules with observations, these, and notes on the others and on doubts."""
+    """The topology of the modules with observations, these, and notes on the others and on doubts.
+
+    missing: those of the notes that name a module of the robot without which the topology is not whole.
+    """
 
     topology: Topology
     observations: Observations
     notes: tuple[str, ...]
+    missing: tuple[str, ...]
 
 
 def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFound:
@@ -52,8 +56,10 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
             f"no module observed any motion: the topology cannot be identified. {reasons}", tuple(serials)
         )
     topology = find_topology(observations, unmoved)
-    excluded = exclusion_notes(recording.journal)
-    return TopologyFound(topology, observations, (*excluded, *_notes(observed, topology)))
+    silent = [f"{s} observed no motion and is left out: its parent is not known" for s in observed.silent]
+    notes = (*exclusion_notes(recording.journal), *silent, *_notes(observed, topology))
+    missing = (*missing_modules(recording.journal), *silent)
+    return TopologyFound(topology, observations, notes, missing)
 
 
 def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
@@ -88,8 +94,7 @@ def _usable(observed: ObservedMotions) -> tuple[dict[tuple[str, str], MotionObse
 
 
 def _notes(observed: ObservedMotions, topology: Topology) -> list[str]:
-    notes = [f"{s} observed no motion and is left out: its parent is not known" for s in observed.silent]
     unknown = "its mounting is not known, and what it carries is attributed to its parent"
     unmoved = {s: why for s, why in observed.unmoved.items() if s in topology.unmoved}
-    notes += [f"joint {s} did not move ({why}): {unknown}" for s, why in unmoved.items()]
+    notes = [f"joint {s} did not move ({why}): {unknown}" for s, why in unmoved.items()]
     return notes + [f"in doubt: {doubt.text}" for doubt in topology.doubts]

@@ -16,9 +16,12 @@ FEEDBACK_WAIT_S = 1.0
 
 
 class ExcludedModules:
-    """The excluded modules in `why`, with the reason; `note(serial, reason)` records an exclusion."""
+    """The excluded modules in `why`, with the reason.
 
-    def __init__(self, group: ModuleGroup, note: Callable[[str, str], None]):
+    note: records an exclusion, by serial, reason, and whether the module's own limits are the reason.
+    """
+
+    def __init__(self, group: ModuleGroup, note: Callable[[str, str, bool], None]):
         self._group = group
         self._note = note
         self.why: dict[str, str] = {}
@@ -52,9 +55,9 @@ class ExcludedModules:
         protects = status is not None and status.state == "fault"
         if serial in self.why or not (beyond or protects) or len(self.movers()) < 2:
             return False
-        self._exclude(serial, str(error))
+        self._exclude(serial, str(error), by_limits=not protects)
         return True
 
-    def _exclude(self, serial: str, why: str) -> None:
+    def _exclude(self, serial: str, why: str, by_limits: bool = False) -> None:
         self.why[serial] = why
-        self._note(serial, why)
+        self._note(serial, why, by_limits)

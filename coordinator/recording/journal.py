@@ -28,7 +28,8 @@ class JournalEvent(BaseModel):
     topology and chain are identified from what was recorded before this event. `settled`: the clocks are
     mapped by the round trips before this event; later requests to the modules do not change them.
     `deaf`: modules that did not confirm the stop of a failed session; None in an older journal, which names
-    them in its text. `finished`: `cpu_us_per_message` is what receiving and recording a message cost.
+    them in its text. `by_limits`: an excluded module is well, but configured to refuse the motion.
+    `finished`: `cpu_us_per_message` is what receiving and recording a message cost.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -42,6 +43,7 @@ class JournalEvent(BaseModel):
     motion: MotionRecord | None = None
     text: str = ""
     deaf: tuple[str, ...] | None = None
+    by_limits: bool | None = None
     robot: str = ""
     imu: ImuKind = "uncalibrated"
     torque: TorqueKind = "uncalibrated"
@@ -89,20 +91,37 @@ def standstill(journal: Sequence[JournalEvent]) -> str:
 
 def excluded_modules(journal: Sequence[JournalEvent]) -> dict[str, str]:
     """Return the excluded modules with the reason, without those that a resumed session has moved."""
-    excluded: dict[str, str] = {}
-    for event in journal:
-        if event.what == "note" and event.step.startswith(STEP):
-            excluded[event.step.removeprefix(STEP)] = event.text
-        elif event.what == "motion" and event.purpose in ("windowed_sine", "whole"):
-            excluded.pop(event.serial, None)
-    return excluded
+    return {serial: event.text for serial, event in _exclusions(journal).items()}
 
 
 def exclusion_notes(journal: Sequence[JournalEvent]) -> tuple[str, ...]:
     """Return a sentence on every excluded module."""
-    return tuple(f"{serial} took no part: {why}" for serial, why in excluded_modules(journal).items())
+    return tuple(_took_no_part(serial, event) for serial, event in _exclusions(journal).items())
 
 
-def exclusion_event(t_ns: int, serial: str, why: str) -> JournalEvent:
-    """Return the journal's note on an excluded module."""
-    return JournalEvent(t_ns=t_ns, what="note", step=STEP + serial, text=why)
+def missing_modules(journal: Sequence[JournalEvent]) -> tuple[str, ...]:
+    """Return a sentence on every module that is absent or at fault, so that the robot is not known whole.
+
+    A module that is configured to refuse the motion is none of them: that its joint was not moved is said.
+    """
+    exclusions = _exclusions(journal).items()
+    return tuple(_took_no_part(serial, event) for serial, event in exclusions if not event.by_limits)
+
+
+def exclusion_event(t_ns: int, serial: str, why: str, by_limits: bool) -> JournalEvent:
+    """Return the journal's note on an excluded module; `by_limits` as of `JournalEvent`."""
+    return JournalEvent(t_ns=t_ns, what="note", step=STEP + serial, text=why, by_limits=by_limits)
+
+
+def _exclusions(journal: Sequence[JournalEvent]) -> dict[str, JournalEvent]:
+    exclusions: dict[str, JournalEvent] = {}
+    for event in journal:
+        if event.what == "note" and event.step.startswith(STEP):
+            exclusions[event.step.removeprefix(STEP)] = event
+        elif event.what == "motion" and event.purpose in ("windowed_sine", "whole"):
+            exclusions.pop(event.serial, None)
+    return exclusions
+
+
+def _took_no_part(serial: str, event: JournalEvent) -> str:
+    return f"{serial} took no part: {event.text}"

@@ -309,9 +309,9 @@ class Session:
                     raise
                 await self._rearm()
 
-    def _note_exclusion(self, serial: str, why: str) -> None:
+    def _note_exclusion(self, serial: str, why: str, by_limits: bool) -> None:
         self._reporter.note(f"going on without {serial}: {why}")
-        self._journal(exclusion_event(self._clock(), serial, why))
+        self._journal(exclusion_event(self._clock(), serial, why, by_limits))
 
     async def _rearm(self) -> None:
         await self._arm()
@@ -330,7 +330,8 @@ class Session:
             await self._step("back", "back to where it stood", back)
         except ModulesJoined as late:
             for serial in late.serials:
-                self._note_exclusion(serial, f"module {serial} came when all had been measured")
+                why = f"module {serial} came when all had been measured"
+                self._note_exclusion(serial, why, by_limits=False)
         await self.group.release_all()
         await self._stop_keeping()
         await self.group.close_gaps()

@@ -177,7 +177,7 @@ def _print_report(out: Path) -> None:
 
 
 def _run_processes(config: LaunchConfig) -> int:
-    """Run all processes; return 0, or `EXIT_SUSPECT` if there is a result in spite of sick sensors."""
+    """Run all processes; return 0, or `EXIT_SUSPECT` if there is a result that is not to be believed."""
 
     def stop(number: int, _frame: FrameType | None) -> None:
         # Once: everything is then stopped in order, and a second signal would leave some of it behind.

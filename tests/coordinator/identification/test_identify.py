@@ -228,7 +228,7 @@ def test_a_module_without_observations_is_excluded_and_named(run: list[Entry]) -
     ]
     identified = identify_kinematics(_recorded(cut))
     assert identified.topology.serials == (BASE,)
-    assert any(TIP in note and "left out" in note for note in identified.notes)
+    assert any(TIP in text and "left out" in text for text in identified.suspicions)
 
 
 def test_a_module_without_round_trips_is_an_error_about_its_clock(run: list[Entry]) -> None:

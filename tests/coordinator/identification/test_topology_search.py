@@ -116,7 +116,8 @@ def test_without_any_heard_module_no_motion_is_repeated(wire: SimpleNamespace) -
 def test_a_module_that_falls_silent_before_all_motions_is_excluded(wire: SimpleNamespace) -> None:
     result = search_topology(recorded(wire, silent_from={"C": 150}), SERIALS)
     assert (result.topology.serials, result.topology.parent) == (("A", "B"), (-1, 0))
-    assert result.notes[0].startswith("C observed no motion and is left out")
+    assert result.missing == (result.notes[0],)
+    assert result.missing[0].startswith("C observed no motion and is left out")
 
 
 def test_observations_before_a_module_falls_silent_count(wire: SimpleNamespace) -> None:

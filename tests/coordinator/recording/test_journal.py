@@ -4,7 +4,13 @@ from typing import Any
 
 import pytest
 
-from coordinator.recording.journal import JournalEvent, standstill
+from coordinator.recording.journal import (
+    JournalEvent,
+    excluded_modules,
+    exclusion_event,
+    missing_modules,
+    standstill,
+)
 from module_agent.wire.refusal import WireError
 
 
@@ -34,6 +40,17 @@ def test_a_robot_whose_modules_all_confirmed_is_stopped() -> None:
 def test_unconfirmed_modules_are_named() -> None:
     text = standstill([_event("failed", text="stopped: A is lost", deaf=("A", "B"))])
     assert text == "A, B did not confirm to have stopped: see that the robot stands still"
+
+
+def test_a_module_that_refuses_by_its_limits_is_excluded_and_not_missing() -> None:
+    refuses = exclusion_event(1, "A", "beyond its range", by_limits=True)
+    hot = exclusion_event(2, "B", "in protection", by_limits=False)
+    journal = [JournalEvent.decode(event.encode()) for event in (refuses, hot)]
+    assert excluded_modules(journal) == {"A": "beyond its range", "B": "in protection"}
+    assert missing_modules(journal) == ("B took no part: in protection",)
+    # A resumed session has moved it.
+    moved = [*journal, _event("motion", serial="B", purpose="windowed_sine")]
+    assert missing_modules(moved) == ()
 
 
 def test_an_event_of_another_version_is_refused_in_words_of_the_field() -> None:
