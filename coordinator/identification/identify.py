@@ -50,7 +50,13 @@ from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, joint_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
-from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules, missing_modules
+from coordinator.recording.journal import (
+    JournalEvent,
+    Purpose,
+    excluded_modules,
+    exclusion_notes,
+    missing_modules,
+)
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
 from coordinator.synchronisation.motion_windows import (
@@ -180,7 +186,8 @@ def _without_sick(recording: Recording, measured: Sequence[CalibrationInformatio
     """
     serials = _explored(recording)
     findings = sensor_findings(recording, serials)
-    excluded = unusable(findings)
+    sick_already = unusable(findings)
+    excluded = tuple(serial for serial in sick_already if serial in serials)
     if any(finding.kind == "encoder_stuck" for finding in findings):
         _check_not_exchanged(recording, serials)
     while len(excluded) < len(serials):
@@ -188,11 +195,10 @@ def _without_sick(recording: Recording, measured: Sequence[CalibrationInformatio
             kept = recording.without(excluded) if excluded else recording
             kinematics = _identify_kinematics(kept, measured)
         except IdentificationError as error:
-            if not excluded or error.findings:
+            if not sick_already or error.findings:
                 raise
-            text = (
-                f"{_summary(findings)}; the robot cannot be identified without {', '.join(excluded)}: {error}"
-            )
+            without = f"the robot cannot be identified without {', '.join(excluded)}: " if excluded else ""
+            text = f"{_reasons(findings, recording)}; {without}{error}"
             raise IdentificationError.of(SensorError(text, findings)) from error
         sick = [one for one in kinematics.findings if unusable([one])]
         if not sick:
@@ -203,11 +209,14 @@ def _without_sick(recording: Recording, measured: Sequence[CalibrationInformatio
             )
         worst = max(sick, key=lambda one: one.sigmas)
         findings, excluded = (*findings, worst), tuple(sorted((*excluded, worst.serial)))
-    raise IdentificationError.of(SensorError(f"{_summary(findings)}; no other module is left", findings))
+    text = f"{_reasons(findings, recording)}; no other module is left"
+    raise IdentificationError.of(SensorError(text, findings))
 
 
-def _summary(findings: Sequence[Finding]) -> str:
-    return "; ".join(finding.summary for finding in findings)
+def _reasons(findings: Sequence[Finding], recording: Recording) -> str:
+    """Return why not all modules were used: what is sick, and who took no part."""
+    took_no_part = exclusion_notes(recording.journal)
+    return "; ".join((*(finding.summary for finding in findings), *took_no_part))
 
 
 def _check_not_exchanged(recording: Recording, serials: Sequence[str]) -> None:

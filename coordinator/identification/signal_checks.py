@@ -83,17 +83,21 @@ def sample_noise(values: Array) -> Array:
 
 
 def sensor_findings(recording: Recording, serials: Sequence[str]) -> tuple[Finding, ...]:
-    """Return the modules of a recording whose sensors or clocks are sick whatever the robot is like."""
+    """Return the modules of a recording whose sensors or clocks are sick whatever the robot is like.
+
+    serials: the modules that took part. One that did not may hold its joint: if its encoder jumps, it turns.
+    """
     silent = [s for s in serials if s not in recording.modules or not len(_all_rows(recording.modules[s]))]
     heard = [s for s in serials if s not in silent]
     rows = {s: _all_rows(recording.modules[s]) for s in heard}
+    beside = {s: _all_rows(module) for s, module in recording.modules.items() if s not in serials}
     events = [e for e in recording.latest_motions("constant", "windowed_sine", "whole") if e.serial in heard]
     return (
         *(_silent(s) for s in silent),
         *_inertial(rows, {s: recording.rest_rows(s) for s in heard}),
         *(one for s in heard for one in _gravity(s, recording.rest_rows(s)["accel_m_s2"].astype(float))),
         *(one for s in heard for one in _joint(s, [e for e in events if e.serial == s], recording)),
-        *(one for s in heard for one in _jumps(s, rows[s])),
+        *(one for s, own in (rows | beside).items() for one in _jumps(s, own)),
         *_clocks(recording, rows),
         *_not_finite(recording, serials),
     )

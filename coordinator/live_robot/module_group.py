@@ -404,7 +404,7 @@ class ModuleGroup:
             status = self.module(serial).status if ended else await self.ask_status(serial)
             motion = status.motion if status is not None else None
             if motion is None or motion.motion_id != started[serial].number or motion.outcome != "done":
-                raise MotionInterrupted(serial, _unfinished(motion))
+                raise MotionInterrupted(serial, _unfinished(status))
             records[serial] = motion
         return records
 
@@ -506,9 +506,13 @@ class ModuleGroup:
         return received()
 
 
-def _unfinished(motion: MotionRecord | None) -> str:
-    if motion is None:
+def _unfinished(status: Status | None) -> str:
+    motion = status.motion if status is not None else None
+    if status is None or motion is None:
         return "lost"
     if motion.outcome == "running":
         return "still running 3 s after its end: the module, or a simulated world, is slower than real time"
+    if motion.outcome == "fault":
+        # Once its lease is acquired anew, a module says no more what was wrong.
+        return f"ended by its protection{f': {status.note}' if status.state == 'fault' else ''}"
     return motion.outcome

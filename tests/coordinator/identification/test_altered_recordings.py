@@ -10,6 +10,7 @@ import pytest
 from coordinator.identification.identified import IdentificationError, Kinematics
 from coordinator.identification.identify import identify, identify_kinematics
 from coordinator.identification.robot_refinement import refine_checked
+from coordinator.recording.journal import JournalEvent, exclusion_event
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.session_file import read_session
 from module_agent.model.errors import EXIT_SUSPECT
@@ -188,12 +189,13 @@ SICK = {
 }
 
 
-def _sick(run: list[Entry], alter: Alterations, serial: str) -> Recording:
+def _sick(run: list[Entry], alter: Alterations, serial: str, of: str = "") -> Recording:
+    """The recording altered from the middle of its motion on, in its own rows or those `of` another."""
     whole = _altered(run, lambda *_: None)
     (motion,) = [e.motion for e in whole.latest_motions("windowed_sine") if e.serial == serial]
     assert motion is not None
     recording = Recording()
-    for entry in alter(run, (serial,), (motion.start_row + (motion.end_row or 0)) // 2):
+    for entry in alter(run, (of or serial,), (motion.start_row + (motion.end_row or 0)) // 2):
         recording.accept(entry)
     return recording
 
@@ -207,6 +209,40 @@ def test_a_sick_module_is_named_and_the_robot_identified_without_it(run: list[En
     # The link between the others is as it would be without the elbow, and its claim holds.
     assert found.result.serials == [YAW, LIFT]
     _covered(found.kinematics)
+
+
+def _held_back(run: list[Entry], serial: str) -> list[Entry]:
+    """The recording as if this module had refused its motions: the others moved, and it held its joint."""
+    refused = exclusion_event(0, serial, "beyond its range", by_limits=True)
+    entries = [Entry("journal", "journal", run[0].t_ns, refused.encode())]
+    for entry in run:
+        event = JournalEvent.decode(entry.payload) if entry.kind == "journal" else None
+        if event is None or event.serial != serial or event.what != "motion":
+            entries.append(entry)
+    return entries
+
+
+def test_an_encoder_that_jumps_is_named_though_its_module_took_no_part(run: list[Entry]) -> None:
+    """Such a module holds its joint, and turns it where its encoder jumps."""
+    held_back = _held_back(run, ELBOW)
+    healthy = identify_kinematics(_altered(held_back, lambda *_: None))
+    assert (healthy.topology.serials, healthy.suspicions) == ((YAW, LIFT), [])
+    found = identify_kinematics(_sick(held_back, jumped("position_rad", 0.05), LIFT, of=ELBOW))
+    assert [(one.serial, one.kind) for one in found.findings if one.serious] == [(ELBOW, "encoder_jump")]
+    assert (found.topology.serials, found.excluded) == ((YAW, LIFT), ())
+    assert ELBOW in found.suspicions[0]
+    _covered(found)
+
+
+def test_an_identification_that_fails_names_who_took_no_part_and_what_is_sick(run: list[Entry]) -> None:
+    entries = _held_back(run, ELBOW)
+    for serial in (YAW, LIFT):
+        entries = dead("accel_m_s2", [0, 1, 2])(entries, (serial,), 0)
+    entries = jumped("position_rad", 0.05)(entries, (ELBOW,), 1000)
+    with pytest.raises(IdentificationError, match=f"{ELBOW} took no part: beyond its range") as refused:
+        identify_kinematics(_altered(entries, lambda *_: None))
+    assert {one.serial for one in refused.value.findings} == {YAW, LIFT, ELBOW}
+    assert refused.value.exit_code == EXIT_SUSPECT
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accelerometer"])

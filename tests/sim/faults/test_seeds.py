@@ -25,6 +25,11 @@ def test_a_session_with_faults_violates_nothing(seed: int) -> None:
     assert report.violations == {}, f"repeat it with: x5-sim faults {report.options()}"
 
 
+@pytest.mark.parametrize("seed", [70105, 70358, 70936])
+def test_a_sick_encoder_is_named_though_its_module_is_in_protection_or_took_no_part(seed: int) -> None:
+    assert run_seed(draw(seed), shrinks=False).named_rightly is True
+
+
 @pytest.mark.parametrize("seed", [2, 4, 5, 6, 8])
 def test_a_session_with_faults_ends_alike_whatever_moves_the_bodies(seed: int) -> None:
     compiled, pybullet = (
