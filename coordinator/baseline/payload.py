@@ -79,6 +79,7 @@ def search_payload(baseline: BaselineRobot, later: BaselineRobot) -> PayloadRepo
         raise PayloadError(
             f"{later.folder} is of another robot than {baseline.folder}: modules {', '.join(serials)} in "
             f"place of {', '.join(chain.serials)}, or mounted differently; identify it again"
+            + "".join(f"; {one}" for one in later.kinematics.suspicions)
         )
     if not baseline.recording.motions("dynamic"):
         raise PayloadError(f"{baseline.folder} has no motions for inertia, since the run had --no-dynamics")

@@ -43,7 +43,8 @@ class Kinematics(NamedTuple):
     findings: sensors that contradict the catalogue or the others. measured: earlier recordings of some of the
     modules, from which the refinement took the prior of their IMUs. excluded: modules without which the robot
     is identified, as their sensors are sick. missing: sentences on modules that were absent or at fault,
-    or observed no motion. damage: sentences on what cannot be read of the recording.
+    observed no motion, or did not move their joint as commanded. damage: sentences on what cannot be read of
+    the recording.
     """
 
     topology: Topology

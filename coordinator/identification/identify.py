@@ -186,8 +186,7 @@ def _without_sick(recording: Recording, measured: Sequence[CalibrationInformatio
     """
     serials = _explored(recording)
     findings = sensor_findings(recording, serials)
-    sick_already = unusable(findings)
-    excluded = tuple(serial for serial in sick_already if serial in serials)
+    excluded = tuple(serial for serial in unusable(findings) if serial in serials)
     if any(finding.kind == "encoder_stuck" for finding in findings):
         _check_not_exchanged(recording, serials)
     while len(excluded) < len(serials):
@@ -195,7 +194,7 @@ def _without_sick(recording: Recording, measured: Sequence[CalibrationInformatio
             kept = recording.without(excluded) if excluded else recording
             kinematics = _identify_kinematics(kept, measured)
         except IdentificationError as error:
-            if not sick_already or error.findings:
+            if not unusable(findings) or error.findings:
                 raise
             without = f"the robot cannot be identified without {', '.join(excluded)}: " if excluded else ""
             text = f"{_reasons(findings, recording)}; {without}{error}"

@@ -11,7 +11,7 @@ from coordinator.identification.topology_observations import (
     slow_motions,
 )
 from coordinator.kinematics.simultaneous_motion import motion_observations
-from coordinator.recording.journal import exclusion_notes, missing_modules
+from coordinator.recording.journal import excluded_modules, exclusion_notes, missing_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.next_motion import NextMotion, next_motions
@@ -30,7 +30,8 @@ from module_agent.model.errors import DataError
 class TopologyFound(NamedTuple):
     """The topology of the modules with observations, these, and notes on the others and on doubts.
 
-    missing: those of the notes that name a module of the robot without which the topology is not whole.
+    missing: those of the notes that name a module without which the topology is not whole, or a joint that
+    was commanded and did not move: what it carries may be elsewhere in the tree.
     """
 
     topology: Topology
@@ -57,8 +58,11 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
         )
     topology = find_topology(observations, unmoved)
     silent = [f"{s} observed no motion and is left out: its parent is not known" for s in observed.silent]
-    notes = (*exclusion_notes(recording.journal), *silent, *_notes(observed, topology))
-    missing = (*missing_modules(recording.journal), *silent)
+    still, excluded = _still(observed, topology), excluded_modules(recording.journal)
+    doubts = [f"in doubt: {doubt.text}" for doubt in topology.doubts]
+    notes = (*exclusion_notes(recording.journal), *silent, *still.values(), *doubts)
+    dead = [text for serial, text in still.items() if serial not in excluded]
+    missing = (*missing_modules(recording.journal), *silent, *dead)
     return TopologyFound(topology, observations, notes, missing)
 
 
@@ -93,8 +97,8 @@ def _usable(observed: ObservedMotions) -> tuple[dict[tuple[str, str], MotionObse
     return left, [s for s in observed.unmoved if s not in observed.silent]
 
 
-def _notes(observed: ObservedMotions, topology: Topology) -> list[str]:
+def _still(observed: ObservedMotions, topology: Topology) -> dict[str, str]:
+    """Return a sentence on every joint of the topology that did not move, by serial."""
     unknown = "its mounting is not known, and what it carries is attributed to its parent"
     unmoved = {s: why for s, why in observed.unmoved.items() if s in topology.unmoved}
-    notes = [f"joint {s} did not move ({why}): {unknown}" for s, why in unmoved.items()]
-    return notes + [f"in doubt: {doubt.text}" for doubt in topology.doubts]
+    return {s: f"joint {s} did not move ({why}): {unknown}" for s, why in unmoved.items()}

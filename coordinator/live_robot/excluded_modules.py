@@ -25,6 +25,7 @@ class ExcludedModules:
         self._group = group
         self._note = note
         self.why: dict[str, str] = {}
+        self._well: set[str] = set()
 
     def movers(self) -> tuple[str, ...]:
         """Return the modules that take part."""
@@ -55,9 +56,17 @@ class ExcludedModules:
         protects = status is not None and status.state == "fault"
         if serial in self.why or not (beyond or protects) or len(self.movers()) < 2:
             return False
-        self._exclude(serial, str(error), by_limits=not protects)
+        self._exclude(serial, str(error), by_limits=beyond)
         return True
+
+    def look_again(self) -> None:
+        """Note the modules refused by their limits that hold their joint no longer: it may have swung."""
+        for serial in sorted(self._well):
+            status = self._group.status_under_lease(serial)
+            if status is not None and status.state in ("fault", "expired"):
+                self._exclude(serial, f"it did not hold its joint to the end: its state is {status.state}")
 
     def _exclude(self, serial: str, why: str, by_limits: bool = False) -> None:
         self.why[serial] = why
+        self._well = self._well | {serial} if by_limits else self._well - {serial}
         self._note(serial, why, by_limits)

@@ -217,13 +217,13 @@ class ModuleGroup:
                 raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s")
             if serial in self._taken_by:
                 raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
-            status = self._status_under_lease(serial)
+            status = self.status_under_lease(serial)
             if status is not None and status.state == "stopped":
                 raise RobotStopped(serial, status.note)
             if status is not None and status.state == "streaming" and serial not in self._streams:
                 raise ModuleLost(serial, "it follows set-points of another program, which has its secret")
 
-    def _status_under_lease(self, serial: str) -> Status | None:
+    def status_under_lease(self, serial: str) -> Status | None:
         """Return the status; None before the lease, as it may report an earlier stop or expiry."""
         status = self.module(serial).status
         fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
@@ -419,7 +419,7 @@ class ModuleGroup:
     def _expired(self, moved: Container[str]) -> str | None:
         """Return a held module without a motion that has expired meanwhile."""
         for serial in self._tokens:
-            status = self._status_under_lease(serial)
+            status = self.status_under_lease(serial)
             if serial not in moved and status is not None and status.state == "expired":
                 return serial
         return None
@@ -429,7 +429,7 @@ class ModuleGroup:
         return status.motion.origin_rad if status is not None and status.motion is not None else 0.0
 
     def _ended(self, serial: str, number: int) -> bool:
-        status = self._status_under_lease(serial)
+        status = self.status_under_lease(serial)
         if status is None:
             return False
         motion = status.motion

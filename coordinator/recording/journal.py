@@ -24,11 +24,12 @@ Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynam
 class JournalEvent(BaseModel):
     """One line of the journal; `what` says which of the other fields are set.
 
-    `anew`: modules have joined the robot, and motions before this event do not describe it. `explored`:
+    `anew`: modules joined or left the robot, and motions before this event do not describe it. `explored`:
     topology and chain are identified from what was recorded before this event. `settled`: the clocks are
     mapped by the round trips before this event; later requests to the modules do not change them.
     `deaf`: modules that did not confirm the stop of a failed session; None in an older journal, which names
-    them in its text. `by_limits`: an excluded module is well, but configured to refuse the motion.
+    them in its text. `by_limits`: an excluded module is well, but configured to refuse the motion; None in an
+    older journal, which does not tell.
     `finished`: `cpu_us_per_message` is what receiving and recording a message cost.
     """
 
@@ -103,9 +104,15 @@ def missing_modules(journal: Sequence[JournalEvent]) -> tuple[str, ...]:
     """Return a sentence on every module that is absent or at fault, so that the robot is not known whole.
 
     A module that is configured to refuse the motion is none of them: that its joint was not moved is said.
+    One of which an older journal does not tell why counts as missing.
     """
-    exclusions = _exclusions(journal).items()
-    return tuple(_took_no_part(serial, event) for serial, event in exclusions if not event.by_limits)
+    well = refused_by_limits(journal)
+    return tuple(_took_no_part(s, event) for s, event in _exclusions(journal).items() if s not in well)
+
+
+def refused_by_limits(journal: Sequence[JournalEvent]) -> set[str]:
+    """Return the excluded modules that are well, but configured to refuse the motion."""
+    return {serial for serial, event in _exclusions(journal).items() if event.by_limits}
 
 
 def exclusion_event(t_ns: int, serial: str, why: str, by_limits: bool) -> JournalEvent:

@@ -18,7 +18,13 @@ from coordinator.live_robot.excluded_modules import ExcludedModules
 from coordinator.live_robot.link_check import check_link
 from coordinator.live_robot.messenger import Clock, Messenger, Refused, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
-from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event, since_joined
+from coordinator.recording.journal import (
+    JournalEvent,
+    Purpose,
+    exclusion_event,
+    refused_by_limits,
+    since_joined,
+)
 from coordinator.recording.recording import Recording
 from coordinator.session.expected_times import ExpectedTimes
 from coordinator.session.motion_selection import TRIAL_RAD, MotionChoice, resting
@@ -128,6 +134,7 @@ class Session:
         self._report("checking the network")
         await check_link(self.group, self._clock, self._plan.link_s, self._reporter.note)
         self._total = 2 + self._steps()
+        self._begin_anew_if_changed()
         self._invalidate_steps_before_boot()
         self._starts = {s: self._position(s) for s in self.group.serials}
         self._times = self._expected()
@@ -213,13 +220,27 @@ class Session:
     async def _begin_anew(self, joined: ModulesJoined) -> None:
         """Let modules take part that have joined the robot; what was measured before does not count."""
         text = f"{joined}: the robot is measured anew with {'it' if len(joined.serials) == 1 else 'them'}"
-        self._reporter.note(text)
-        self._journal(JournalEvent(t_ns=self._clock(), what="anew", text=text))
-        self._done.clear()
+        self._note_anew(text)
         self._starts |= {serial: self._position(serial) for serial in joined.serials}
         await gather_all(self._arm_one(serial) for serial in joined.serials)
         self._total = self._index + self._steps()
         self._times = self._expected()
+
+    def _begin_anew_if_changed(self) -> None:
+        """Keep no step of a session that is resumed if the robot has other modules now than it had then."""
+        journal = self._recording.journal
+        rested = {e.serial for e in since_joined(journal) if e.what == "motion" and e.purpose == "rest"}
+        here = set(self.group.serials)
+        come = sorted(here - rested - refused_by_limits(journal))
+        gone = sorted(rested - here)
+        if rested and (come or gone):
+            changes = [f"{serial} came" for serial in come] + [f"{serial} went" for serial in gone]
+            self._note_anew(f"since the session before {', '.join(changes)}: the robot is measured anew")
+
+    def _note_anew(self, text: str) -> None:
+        self._reporter.note(text)
+        self._journal(JournalEvent(t_ns=self._clock(), what="anew", text=text))
+        self._done.clear()
 
     async def _discover(self, expect: int | None) -> None:
         self._report("discovering modules")
@@ -332,6 +353,7 @@ class Session:
             for serial in late.serials:
                 why = f"module {serial} came when all had been measured"
                 self._note_exclusion(serial, why, by_limits=False)
+        self._excluded.look_again()
         await self.group.release_all()
         await self._stop_keeping()
         await self.group.close_gaps()

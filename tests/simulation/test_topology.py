@@ -10,7 +10,7 @@ import pytest
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.topology_search import TopologyFound, doubtful_motions, search_topology
-from coordinator.recording.journal import JournalEvent
+from coordinator.recording.journal import JournalEvent, missing_modules
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.session.session import NoModulesFound, Session
 from coordinator.topology.next_motion import NextMotion
@@ -127,7 +127,9 @@ def test_what_a_joint_with_a_dead_motor_carries_shows_on_what_carries_it(arm: An
     found = search_topology(explore(arm)[0], arm.serials)
     assert found.topology.unmoved == ("yaw",)
     assert edges(found) == WHOLE | {"lift": ("base", False)}
-    assert any(note.startswith("joint yaw did not move") for note in found.notes)
+    (why,) = found.missing
+    assert why.startswith("joint yaw did not move")
+    assert why in found.notes
 
 
 def test_a_push_while_a_joint_moves_is_a_doubt_that_another_motion_settles(arm: Any) -> None:
@@ -178,6 +180,8 @@ def test_a_module_that_sends_no_feedback_is_left_out_by_name(
     recording, watcher = explore(arm)
     assert edges(search_topology(recording, rested(recording))) == {s: WHOLE[s] for s in arm.serials[:3]}
     assert any("module wrist answers, but sends no feedback" in note for note in watcher.notes)
+    (missing,) = search_topology(recording, rested(recording)).missing
+    assert missing.startswith("wrist took no part")
 
 
 def narrow_elbow(arm: Any) -> None:
@@ -210,6 +214,18 @@ def test_a_joint_whose_limits_forbid_the_motion_is_named_and_all_else_is_explore
     # It is well, and there: what it refuses is no reason to doubt the others.
     assert any(note.startswith("elbow took no part") for note in found.notes)
     assert found.missing == ()
+
+
+def test_a_module_that_its_limits_excluded_and_that_lets_go_of_its_joint_later_is_missing(arm: Any) -> None:
+    narrow_elbow(arm)
+
+    def overheat(step: str) -> None:
+        if step == "exploring joint yaw":
+            arm.hosts["elbow"].modules[0].firmware._enter("fault", "winding at 121 C")
+
+    recording, _ = explore(arm, on_step=overheat)
+    (why,) = missing_modules(recording.journal)
+    assert why == "elbow took no part: it did not hold its joint to the end: its state is fault"
 
 
 def test_where_no_module_responds_the_session_says_so(arm: Any) -> None:

@@ -288,6 +288,26 @@ def test_a_robot_of_which_nothing_healthy_is_left_is_refused_by_name(run: list[E
     assert {one.serial for one in refused.value.findings} == {YAW, LIFT, ELBOW}
 
 
+def test_what_only_the_fit_shows_is_named_where_the_robot_cannot_be_identified_without_it(
+    run: list[Entry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = _sick(run, multiplied(("gyro_rad_s",), 1.05), ELBOW)
+    kinematics = identify_kinematics(recording)
+    worst = kinematics.findings[0]._replace(kind="gyro_stuck")
+    found = iter([kinematics._replace(findings=(worst,))])
+
+    def fit(*_: Any) -> Kinematics:
+        for one in found:
+            return one
+        raise IdentificationError("no exploration was recorded")
+
+    monkeypatch.setattr("coordinator.identification.identify._identify_kinematics", fit)
+    why = f"{ELBOW}: .*; the robot cannot be identified without {ELBOW}: no exploration was recorded"
+    with pytest.raises(IdentificationError, match=why) as refused:
+        identify_kinematics(recording)
+    assert (refused.value.exit_code, refused.value.findings) == (EXIT_SUSPECT, (worst,))
+
+
 def _relabelled(run: list[Entry], serial: str, label: str) -> list[Entry]:
     entries = []
     for entry in run:

@@ -98,6 +98,7 @@ def test_a_joint_that_is_stuck_is_a_leaf_and_named_with_how_little_it_moved(wire
     assert result.topology.parent == (-1, 0, 0)
     assert result.topology.unmoved == ("B",)
     (note,) = result.notes
+    assert result.missing == (note,)
     assert "joint B did not move (it turned at only" in note
 
 

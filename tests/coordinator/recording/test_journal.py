@@ -48,6 +48,9 @@ def test_a_module_that_refuses_by_its_limits_is_excluded_and_not_missing() -> No
     journal = [JournalEvent.decode(event.encode()) for event in (refuses, hot)]
     assert excluded_modules(journal) == {"A": "beyond its range", "B": "in protection"}
     assert missing_modules(journal) == ("B took no part: in protection",)
+    # An older journal does not tell, and its module is not believed to be well.
+    older = hot.model_copy(update={"by_limits": None})
+    assert missing_modules([JournalEvent.decode(older.encode())]) == ("B took no part: in protection",)
     # A resumed session has moved it.
     moved = [*journal, _event("motion", serial="B", purpose="windowed_sine")]
     assert missing_modules(moved) == ()
