@@ -128,7 +128,7 @@ class Remeasurement:
 
 
 class SuspectMeasurement(RobotError):
-    """Sensors contradicted each other while the robot was measured again; the message says which."""
+    """The robot was measured again, and the result is suspect; the message says why."""
 
 
 def measuring_plan(aim: Aim, known: BaselineRobot, plan: Plan) -> Plan:

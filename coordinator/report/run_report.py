@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from coordinator.identification.result import DynamicsPart, Result
-from coordinator.recording.journal import JournalEvent, excluded_modules
+from coordinator.recording.journal import JournalEvent, excluded_modules, exclusion_notes
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import HELD_OUT, REPORT, RESULT, SESSION, load_recording
 from coordinator.report.document import (
@@ -142,7 +142,8 @@ def _summary(run: RunData) -> Section:
         why = failed[-1] if failed else "the recording ends without a word on why"
         blocks = [Paragraph(text=f"The run ended early: {why}."), _modules(run)]
         return Section(title="Summary", blocks=tuple(blocks))
-    items = [sure_topology(result)]
+    items = [f"The result is not to be believed as usual: {why}." for why in result.suspicions]
+    items.append(sure_topology(result))
     spread = [HALF_95 * link.link_length_sigma_mm for link in result.links]
     if spread:
         items.append(
@@ -227,10 +228,8 @@ def _findings(run: RunData) -> Section:
             for one in run.result.sensors
         ]
         blocks.append(Table.of("Sensors and links that contradict the model", columns, rows))
-    notes = list(run.result.notes) if run.result is not None else []
-    notes += [
-        f"{serial} was excluded: {why}" for serial, why in excluded_modules(run.recording.journal).items()
-    ]
+    # The notes of a result have these, too.
+    notes = exclusion_notes(run.recording.journal) if run.result is None else run.result.notes
     if notes:
         blocks.append(Bullets(items=tuple(notes)))
     if not blocks:

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
 from coordinator.main import app
-from coordinator.recording.journal import JournalEvent
+from coordinator.recording.journal import JournalEvent, exclusion_event
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry
 from coordinator.recording.run_folder import REPORT, RESULT, SESSION
 from coordinator.recording.session_file import SessionWriter, read_session
@@ -25,6 +25,7 @@ from coordinator.report.plots import robot_plot, without_pauses
 from coordinator.report.result_sections import HALF_95
 from coordinator.report.run_report import MAX_BARS, read_run, run_report, step_bars
 from module_agent.model.chain import Chain
+from module_agent.model.errors import EXIT_SUSPECT
 from sim.robot.robot_file import load_robot
 from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from tests.random_chains import random_robot
@@ -227,6 +228,22 @@ def test_a_run_without_any_joint_and_without_an_end_is_reported(folder: Path, tm
     document = run_report(read_run(ended))
     assert "No module answered" in html_page(document)
     assert "before any joint was explored" in html_page(document)
+
+
+def test_a_recording_in_which_a_module_took_no_part_ends_with_code_5_and_the_report_says_why(
+    folder: Path, tmp_path: Path
+) -> None:
+    writer = SessionWriter(tmp_path / SESSION)
+    entries = list(read_session(folder / SESSION))
+    silent = exclusion_event(entries[0].t_ns, "X-66666", "it did not answer", by_limits=False)
+    for entry in (entries[0], Entry("journal", JOURNAL_TOPIC, silent.t_ns, silent.encode()), *entries[1:]):
+        writer.write(entry)
+    writer.close()
+    again = CliRunner().invoke(app, ["replay", str(tmp_path)])
+    assert again.exit_code == EXIT_SUSPECT, again.output
+    why = "The result is not to be believed as usual: X-66666 took no part: it did not answer."
+    page = (tmp_path / REPORT).read_text()
+    assert why in page[: page.index("<h2>Topology")]
 
 
 def interrupted(out: Path, lines: list[str]) -> None:
