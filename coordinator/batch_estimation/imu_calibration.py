@@ -93,6 +93,7 @@ class CalibrationInformation(NamedTuple):
 
     matrix: (40 n, 40 n), positive semidefinite. vector: (40 n,) the matrix times the parameters. session: the
     trace hash of the recording, which identifies it; empty if it has none yet. imu: the session's prior.
+    suspicions: why the recording is not to be believed as usual.
     """
 
     serials: tuple[str, ...]
@@ -100,6 +101,12 @@ class CalibrationInformation(NamedTuple):
     vector: Array
     session: str = ""
     imu: ImuKind = "uncalibrated"
+    suspicions: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The recording, for messages."""
+        return f"recording {self.session[:12]}"
 
 
 def catalogued(serials: Sequence[str], prior: ImuPrior) -> ImuCalibration:

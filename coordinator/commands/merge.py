@@ -10,8 +10,9 @@ from coordinator.merge.calibration_file import each_once, read_calibration, writ
 from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_calibrations import merge_calibrations
 from coordinator.merge.merge_runs import merge_runs
-from coordinator.merge.report import MERGED, merge_report
+from coordinator.merge.report import MERGED, MergeReport, merge_report
 from coordinator.recording.run_folder import CALIBRATION, INFORMATION
+from coordinator.runtime.command_line import end_if_suspect
 from coordinator.runtime.terminal import new_table, print_table, write_result
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json
@@ -29,6 +30,7 @@ def merge(
 
     The robot may be assembled differently in every run: in another order, on another base, with further
     modules. Each link must stay with the module that it leads to. `run --measured OUT` begins with the IMUs.
+    Exit code 5: one of the runs, or of those that they began with, is suspect, by its own exit code 5.
     """
     if len(runs) < 2:
         raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
@@ -36,12 +38,19 @@ def merge(
     # Runs of earlier versions have none.
     recordings = [read_calibration(file) if file.is_file() else () for file in files]
     imus = merge_calibrations(recordings)
-    report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]), imus)
+    everything = each_once(one for run in recordings for one in run)
+    suspicions = [f"{one.name}: {why}" for one in everything for why in one.suspicions]
+    merged = merge_runs([read_information(run / INFORMATION) for run in runs])
+    report = merge_report(merged, imus, suspicions)
     out.mkdir(parents=True, exist_ok=True)
-    write_calibration(out / CALIBRATION, each_once(one for run in recordings for one in run))
+    write_calibration(out / CALIBRATION, everything)
     write_json(out / MERGED, report)
-    if not write_result(json_file, report):
-        return
+    if write_result(json_file, report):
+        _print(report)
+    end_if_suspect(suspicions)
+
+
+def _print(report: MergeReport) -> None:
     table = new_table(
         f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts",
         "run | modules | rank | below 10 % | below 10 %, merged | sigma merged / alone | "

@@ -60,13 +60,23 @@ class Kinematics(NamedTuple):
 
     @property
     def dynamic(self) -> bool:
-        """Whether torques tell of all bodies: no joint's motion is unknown, and every effort is measured."""
+        """Whether torques tell of all bodies: every joint is known and moved, every effort is measured."""
         sick = UNUSABLE | {"effort_stuck"}
-        return not any(one.serious and one.kind in sick for one in self.findings)
+        return not self.missing and not any(one.serious and one.kind in sick for one in self.findings)
 
     @property
     def suspicions(self) -> list[str]:
         """Why the robot is not to be believed as usual, as sentences; none of healthy robots."""
+        before = (
+            f"the earlier {one.name} is used, and there {why}"
+            for one in self.measured
+            for why in one.suspicions
+        )
+        return [*self.own_suspicions, *before]
+
+    @property
+    def own_suspicions(self) -> list[str]:
+        """The suspicions of this recording, without those of earlier ones."""
         return [*(one.summary for one in self.findings if one.serious), *self.missing, *self.damage]
 
     @property
@@ -92,7 +102,9 @@ class Kinematics(NamedTuple):
 def calibrations(kinematics: Kinematics, recording: Recording) -> tuple[CalibrationInformation, ...]:
     """Return what a recording tells of its IMUs, by its kinematics, and after it what earlier ones told."""
     own = kinematics.refinement.calibration_information
-    return (own._replace(session=recording.trace_hash, imu=recording.imu), *kinematics.measured)
+    suspicions = tuple(kinematics.own_suspicions)
+    own = own._replace(session=recording.trace_hash, imu=recording.imu, suspicions=suspicions)
+    return (own, *kinematics.measured)
 
 
 class HeldOutMotion(NamedTuple):

@@ -26,6 +26,7 @@ def write_calibration(path: Path, recordings: Sequence[CalibrationInformation]) 
     for k, one in enumerate(recordings):
         arrays[f"serials{k}"] = np.array(one.serials)
         arrays[f"matrix{k}"], arrays[f"vector{k}"], arrays[f"imu{k}"] = one.matrix, one.vector, one.imu
+        arrays[f"suspicions{k}"] = np.array(one.suspicions, dtype=np.str_)
     write_arrays(path, VERSION, arrays)
 
 
@@ -51,4 +52,8 @@ def _recording(arrays: dict[str, Any], k: int) -> CalibrationInformation:
         raise DataError("a value is not finite")
     kind: ImuKind = "calibrated" if arrays[f"imu{k}"] == "calibrated" else "uncalibrated"
     session = str(arrays["sessions"][k])
-    return CalibrationInformation(tuple(serials.tolist()), frozen(matrix), frozen(vector), session, kind)
+    # Files of earlier versions have none.
+    suspicions = tuple(np.asarray(arrays.get(f"suspicions{k}", ()), dtype=np.str_).tolist())
+    return CalibrationInformation(
+        tuple(serials.tolist()), frozen(matrix), frozen(vector), session, kind, suspicions
+    )

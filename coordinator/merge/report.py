@@ -1,6 +1,9 @@
 """`merged.json`: the base parameters of module parts that several runs determine together."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from pydantic import Field
 
 from coordinator.merge.merge_calibrations import MergedCalibration
 from coordinator.merge.merge_runs import MergedInformation, RunShare
@@ -38,7 +41,7 @@ class RunPart(Part):
 
 
 class MergeReport(Part):
-    """All runs together. gain: as of a run, over all of them.
+    """All runs together. gain: as of a run, over all of them. suspicions: why runs are not to be believed.
 
     Schema 2 names `base_parameters` with their `sigma`, and `summary` (in schema 1 `sums` and `words`).
     """
@@ -51,9 +54,12 @@ class MergeReport(Part):
     runs: list[RunPart]
     base_parameters: list[BaseParameterPart]
     imu_places: list[ImuPlacePart]
+    suspicions: list[str] = Field(default_factory=list)
 
 
-def merge_report(merged: MergedInformation, imus: MergedCalibration) -> MergeReport:
+def merge_report(
+    merged: MergedInformation, imus: MergedCalibration, suspicions: Sequence[str] = ()
+) -> MergeReport:
     """Return the report of merged runs."""
     base = merged.base
     return MergeReport(
@@ -64,6 +70,7 @@ def merge_report(merged: MergedInformation, imus: MergedCalibration) -> MergeRep
         runs=[_run(*run) for run in zip(merged.runs, imus.inconsistency_sigma, strict=True)],
         base_parameters=base_parameter_parts(base),
         imu_places=imu_place_parts(imus.calibration),
+        suspicions=list(suspicions),
     )
 
 

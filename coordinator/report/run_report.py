@@ -146,11 +146,14 @@ def _summary(run: RunData) -> Section:
     items.append(sure_topology(result))
     spread = [HALF_95 * link.link_length_sigma_mm for link in result.links]
     if spread:
-        items.append(
-            f"{_links_known(len(spread))} within ± {min(spread):.2g} to {max(spread):.2g} mm (95 %)."
-        )
+        items.append(f"{_links_known(len(spread))} within ± {_from_to(min(spread), max(spread))} mm (95 %).")
     if result.dynamics is None:
-        items.append("Inertial parameters were not asked for.")
+        withheld = bool(result.suspicions) and run.recording.motions("dynamic")
+        items.append(
+            "Inertial parameters are not identified, as a robot that is not to be believed has none."
+            if withheld
+            else "Inertial parameters were not asked for."
+        )
     else:
         items += _sure_inertia(result.dynamics)
     if result.unresolved:
@@ -167,6 +170,11 @@ def _summary(run: RunData) -> Section:
     )
     blocks = [Bullets(items=tuple(items)), drawing, _modules(run)]
     return Section(title="Summary", blocks=tuple(blocks))
+
+
+def _from_to(least: float, most: float) -> str:
+    ends = f"{least:.2g}", f"{most:.2g}"
+    return " to ".join(dict.fromkeys(ends))
 
 
 def _links_known(count: int) -> str:

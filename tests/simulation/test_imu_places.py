@@ -134,6 +134,20 @@ def test_in_either_order_the_truth_is_covered_and_a_session_adds_what_it_does_al
     np.testing.assert_allclose(within, alone, rtol=0.3, atol=0.1 * PLACE_SIGMA_M**-2)
 
 
+def test_what_begins_with_a_suspect_run_is_suspect_and_says_which(assemblies: dict[str, Session]) -> None:
+    before, after = assemblies["middle"], assemblies["distal"]
+    assert identify_kinematics(after.recording, calibrations(before.alone, before.recording)).suspicions == []
+    sick = before.alone._replace(missing=("wrist took no part: it was silent",))
+    kinematics = identify_kinematics(after.recording, calibrations(sick, before.recording))
+    assert kinematics.own_suspicions == []
+    which = f"the earlier recording {before.recording.trace_hash[:12]} is used"
+    assert kinematics.suspicions == [f"{which}, and there wrist took no part: it was silent"]
+    # Torques of this recording tell of all bodies all the same, and the next run hears of the sick one once.
+    assert kinematics.dynamic
+    passed_on = calibrations(kinematics, after.recording)
+    assert [one.suspicions for one in passed_on] == [(), tuple(sick.missing)]
+
+
 def test_a_run_that_began_with_earlier_ones_is_complete_and_a_replay_the_same(
     plan: Plan, tmp_path: Path
 ) -> None:

@@ -12,7 +12,9 @@ from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.main import app
+from coordinator.merge.calibration_file import read_calibration, write_calibration
 from coordinator.merge.information_file import (
     RunInformation,
     read_information,
@@ -23,7 +25,7 @@ from coordinator.merge.run_arrays import RunArraysError
 from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from coordinator.parameter_fit.systematic_errors import chain_effects, error_directions
-from coordinator.recording.run_folder import INFORMATION
+from coordinator.recording.run_folder import CALIBRATION, INFORMATION
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import compress, merge
 from module_agent.model.perturbation import apply_perturbation
@@ -345,6 +347,26 @@ def test_the_command_merges_folders_and_says_by_how_much(tmp_path: Path) -> None
     assert twice.exit_code == 1
     assert "one and one are of the same recording" in " ".join(twice.output.split())
     assert not (tmp_path / "twice").exists()
+
+
+def test_a_suspect_run_makes_what_it_is_merged_into_suspect(tmp_path: Path) -> None:
+    rng, size = default_rng(19), 40 * len(SERIALS)
+    for name, why in (("well", ()), ("sick", ("B took no part: it was silent",))):
+        (tmp_path / name).mkdir()
+        write_information(tmp_path / name / INFORMATION, measured(rng, assembled(rng)))
+        told = CalibrationInformation(SERIALS, np.zeros((size, size)), np.zeros(size), name, suspicions=why)
+        write_calibration(tmp_path / name / CALIBRATION, [told])
+    folders, out = [str(tmp_path / name) for name in ("well", "sick")], tmp_path / "both"
+    done = CliRunner().invoke(app, ["merge", *folders, "--out", str(out)])
+    assert done.exit_code == 5
+    said = "recording sick: B took no part: it was silent"
+    assert said in " ".join(done.output.split())
+    assert json.loads((out / "merged.json").read_text())["suspicions"] == [said]
+    # A merge of the merged says it, too: it is in the file that a run may begin with.
+    assert [one.suspicions for one in read_calibration(out / CALIBRATION)] == [
+        (),
+        ("B took no part: it was silent",),
+    ]
 
 
 def test_the_command_says_what_it_needs(tmp_path: Path) -> None:

@@ -243,7 +243,13 @@ def test_a_recording_in_which_a_module_took_no_part_ends_with_code_5_and_the_rep
     assert again.exit_code == EXIT_SUSPECT, again.output
     why = "The result is not to be believed as usual: X-66666 took no part: it did not answer."
     page = (tmp_path / REPORT).read_text()
-    assert why in page[: page.index("<h2>Topology")]
+    summary = page[: page.index("<h2>Topology")]
+    assert why in summary
+    # Torques of a robot that has one more module are not those of the bodies that are known.
+    assert "Inertial parameters are not identified" in summary
+    assert Result.model_validate_json((tmp_path / RESULT).read_bytes()).dynamics is None
+    # The length of the only link has one interval.
+    assert re.search(r"The length of the only link is known within ± [\d.]+ mm", summary)
 
 
 def interrupted(out: Path, lines: list[str]) -> None:
