@@ -43,6 +43,12 @@ def faults(
         list[str] | None, typer.Option(help="A fault, as a report prints it; repeat for more [drawn].")
     ] = None,
     physics: Annotated[Physics, typer.Option(help="What moves the bodies.")] = "compiled",
+    expect: Annotated[
+        bool | None,
+        typer.Option(
+            help="Tell the coordinator how many modules there are, or do not [drawn].", show_default=False
+        ),
+    ] = None,
     shrink: Annotated[bool, typer.Option(help="Make what violates an invariant simpler.")] = True,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
@@ -62,7 +68,7 @@ def faults(
     """
     numbers = seed_range(seeds)
     schedules = [
-        _schedule(seed, robot, modules, network, fault)._replace(physics=physics) for seed in numbers
+        _schedule(seed, robot, modules, network, fault, expect)._replace(physics=physics) for seed in numbers
     ]
     units = [
         Unit(f"seed {one.seed}", run_seed, (one, shrink), kind=SeedReport, cost_s=COST_S) for one in schedules
@@ -128,7 +134,12 @@ def _document(report: SeedReport) -> dict[str, Any]:
 
 
 def _schedule(
-    seed: int, robot: str | None, modules: int | None, network: str | None, faults: list[str] | None
+    seed: int,
+    robot: str | None,
+    modules: int | None,
+    network: str | None,
+    faults: list[str] | None,
+    expect: bool | None,
 ) -> Schedule:
     chosen = None if robot is None else load(robot)
     if chosen is not None and modules is not None:
@@ -139,6 +150,8 @@ def _schedule(
     if network is not None:
         check_network(network)
         schedule = schedule._replace(network=network)
+    if expect is not None:
+        schedule = schedule._replace(expects=expect)
     if faults is not None:
         given = sorted((fault_of(text) for text in faults), key=lambda fault: fault.at_s)
         schedule = schedule._replace(faults=tuple(_of_robot(one, schedule) for one in given))

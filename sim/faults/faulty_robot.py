@@ -83,6 +83,11 @@ class FaultyRobot(VirtualRobot):
         """Boot ids in order: agents can be started any number of times."""
         return np.random.SeedSequence(settings.seed), itertools.count(101)
 
+    @property
+    def announced(self) -> frozenset[str]:
+        """The modules that say on the network that they are there; a frozen agent does."""
+        return frozenset(self.hosts) | frozenset(self._away)
+
     def begin(self, fault: Fault) -> None:
         """Let a fault of agents or motors begin, and see to its end."""
         BEGINNINGS[fault.kind](self, fault)

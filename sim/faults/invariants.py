@@ -1,11 +1,9 @@
 """What must hold of every session, whatever happened in it."""
 
-import json
 from pathlib import Path
 
-from coordinator.recording.journal import excluded_modules
-from coordinator.recording.recording import Recording
-from coordinator.recording.run_folder import RESULT, SESSION, load_recording
+from coordinator.recording.journal import refused_by_limits
+from coordinator.recording.run_folder import SESSION, load_recording
 from module_agent.model.errors import RobotError
 from sim.faults.run import Ending
 from sim.faults.schedule import Schedule
@@ -31,7 +29,7 @@ def check_folder(out: Path, ending: Ending) -> dict[str, str]:
             if recording.damage and ending.name != "lost":
                 violations["unreadable recording"] = recording.damage[0]
     if ending.name == "result" and recording is not None:
-        wrong = _wrong(out, recording)
+        wrong = _wrong(out, refused_by_limits(recording.journal) | ending.unheard)
         if wrong:
             violations["wrong robot"] = wrong
     return violations
@@ -48,9 +46,9 @@ def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
     return bool(accused) and not accused & sick and "expected, found" not in ending.text
 
 
-def _wrong(out: Path, recording: Recording) -> str:
+def _wrong(out: Path, unknown: set[str]) -> str:
+    """Say what is wrong with the result, but for joints of `unknown` modules, which nothing could show."""
     scored = score(out)
-    unknown = _told_unknown(out, recording)
     differences = [text for text in scored.topology_differences if not any(s in text for s in unknown)]
     if differences:
         return "; ".join(differences)
@@ -61,10 +59,3 @@ def _wrong(out: Path, recording: Recording) -> str:
         if error is not None and not abs(error) <= max(SIGMAS * sigma, RESOLUTION_MM):
             return f"link {link.parent} - {link.child} is {error:+.2f} mm off, claimed sigma {sigma:.2f} mm"
     return ""
-
-
-def _told_unknown(out: Path, recording: Recording) -> set[str]:
-    """Return modules whose mounting, or what they carry, the result says it does not know."""
-    written = json.loads((out / RESULT).read_text())
-    still = {s for s in written["serials"] if any(f"joint {s} did not move" in n for n in written["notes"])}
-    return still | set(excluded_modules(recording.journal))

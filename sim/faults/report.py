@@ -24,7 +24,7 @@ MAX_SHRINKING = 20
 class SeedReport(NamedTuple):
     """What became of a seed.
 
-    modules, network, faults, physics: the session, so that it can be run again. kinds: of its faults.
+    modules, network, faults, physics, expects: the session, so that it can be run again. kinds: of faults.
     outcome: the right robot with exit code 0, a result called suspect, an error that names what
     may have happened, one that accuses a healthy module, stopped with its coordinator killed, or a violation
     of an invariant.
@@ -45,14 +45,16 @@ class SeedReport(NamedTuple):
     named_rightly: bool | None = None
     simplest: "SeedReport | None" = None
     physics: Physics = "compiled"
+    expects: bool = True
 
     def options(self, robot: str | None = None) -> str:
         """Return the options of `x5-sim faults` that repeat it; `robot` is the robot as the user gave it."""
         faults = "".join(f' --fault "{fault}"' for fault in self.faults)
         engine = "" if self.physics == "compiled" else f" --physics {self.physics}"
+        expect = "--expect" if self.expects else "--no-expect"
         return (
             f"--seeds {self.seed}..{self.seed} --robot {robot or self.robot} --modules {self.modules} "
-            f"--network {self.network}{engine}{faults}"
+            f"--network {self.network}{engine} {expect}{faults}"
         )
 
 
@@ -97,6 +99,7 @@ def _judged(schedule: Schedule) -> SeedReport:
         outcome="violation" if violations else outcome,
         violations=violations,
         physics=schedule.physics,
+        expects=schedule.expects,
         named_rightly=named if outcome in ("named", "misnamed", "suspect") and not violations else None,
     )
 

@@ -48,12 +48,14 @@ class Ending(NamedTuple):
     """How a session ended: `result`, `suspect`, `lost`, `unbounded`, or by the name of an error.
 
     suspect: a result that its program does not believe as usual, by exit code 5; the text says why. lost: its
-    coordinator was killed. at_s: when it ended.
+    coordinator was killed. at_s: when it ended. unheard: modules that were not announced then, which a
+    coordinator cannot miss that is not told how many there are.
     """
 
     name: str
     text: str = ""
     at_s: float = math.inf
+    unheard: frozenset[str] = frozenset()
 
 
 class _Killed(BaseException):
@@ -144,6 +146,8 @@ class _Session:
         if ending.name == "lost" and self._restarts:
             self._sender = SUCCESSOR
             ending = self._coordinate(resume=True)
+        if not self._schedule.expects:
+            ending = ending._replace(unheard=frozenset(robot.serials) - robot.announced)
         ending = ending._replace(at_s=loop.now_ns / NS_PER_S)
         self._over = True
         if ending.name != "unbounded":
@@ -160,7 +164,7 @@ class _Session:
             out=self._out,
             sender=Sender(self._sender, SECRET),
             plan=QUICK_PLAN,
-            expect=len(robot.serials),
+            expect=len(robot.serials) if self._schedule.expects else None,
             resume=resume,
             inline=True,
             refined_previews=0,

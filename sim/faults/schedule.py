@@ -28,6 +28,8 @@ SMALL_ROBOTS = (
 NETWORKS = ("none", "lan", "wifi")
 # A session of two joints takes 15 s; a fault after its end is none.
 LATEST_S = 14.0
+# The share of sessions whose coordinator is told how many modules there are, as most users would.
+EXPECTING = 0.75
 SHORTEST_S, LONGEST_S = 0.02, 1.5
 # From where a joint begins to the limits of its position, at the least and at the most: the motions of a
 # short session go to half a radian, and near a limit they would be slowed down.
@@ -35,13 +37,17 @@ ROOM_RAD = (0.8, 1.4)
 
 
 class Schedule(NamedTuple):
-    """One session: robot, network profile by name, faults in the order of their time, the world's engine."""
+    """One session: robot, network profile by name, faults in the order of their time, the world's engine.
+
+    expects: whether the coordinator is told how many modules there are.
+    """
 
     seed: int
     robot: Robot
     network: str
     faults: tuple[Fault, ...]
     physics: Physics = "compiled"
+    expects: bool = True
 
 
 def draw(seed: int, robot: Robot | None = None) -> Schedule:
@@ -55,7 +61,9 @@ def draw(seed: int, robot: Robot | None = None) -> Schedule:
     )
     count = int(_stream(seed, "count").choice((1, 2, 3), p=(0.6, 0.3, 0.1)))
     faults = [_fault(seed, number, len(drawn.modules)) for number in range(count)]
-    return Schedule(seed, drawn, network, tuple(sorted(faults, key=lambda fault: fault.at_s)))
+    expects = bool(_stream(seed, "expect").random() < EXPECTING)
+    ordered = tuple(sorted(faults, key=lambda fault: fault.at_s))
+    return Schedule(seed, drawn, network, ordered, expects=expects)
 
 
 def position_ranges(schedule: Schedule) -> dict[str, tuple[float, float]]:

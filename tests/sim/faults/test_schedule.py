@@ -34,6 +34,11 @@ def test_every_kind_of_fault_is_drawn_in_time_and_for_a_module_that_exists(drawn
         assert not any(math.isinf(f.for_s) for f in one.faults if f.nature.ends == "after")
 
 
+def test_of_some_sessions_the_coordinator_is_not_told_how_many_modules_there_are(drawn: Any) -> None:
+    """A quarter: of 300 these are 75, give or take four standard deviations."""
+    assert 45 <= sum(not one.expects for one in drawn) <= 105
+
+
 def test_an_added_kind_changes_the_seeds_that_draw_it_and_no_others(
     monkeypatch: pytest.MonkeyPatch, drawn: Any
 ) -> None:
