@@ -29,7 +29,7 @@ def check_folder(out: Path, ending: Ending) -> dict[str, str]:
             if recording.damage and ending.name != "lost":
                 violations["unreadable recording"] = recording.damage[0]
     if ending.name == "result" and recording is not None:
-        wrong = _wrong(out, refused_by_limits(recording.journal) | ending.unheard)
+        wrong = _wrong(out, ending.unheard, refused_by_limits(recording.journal))
         if wrong:
             violations["wrong robot"] = wrong
     return violations
@@ -46,14 +46,25 @@ def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
     return bool(accused) and not accused & sick and "expected, found" not in ending.text
 
 
-def _wrong(out: Path, unknown: set[str]) -> str:
-    """Say what is wrong with the result, but for joints of `unknown` modules, which nothing could show."""
+def _wrong(out: Path, unheard: frozenset[str], unmoved: set[str]) -> str:
+    """Say what is wrong with the result, but for what nothing could show.
+
+    unheard: modules that do not exist for the coordinator, whose neighbours are mounted on each other for it.
+    unmoved: modules that refused to turn their joint by their own limits: how they are mounted, and what they
+    carry, is not known.
+    """
     scored = score(out)
-    differences = [text for text in scored.topology_differences if not any(s in text for s in unknown)]
+    carried = {link.child for link in scored.links if link.parent in unheard | unmoved}
+    unknown = (
+        *(f"module {serial} was not found" for serial in unheard),
+        *(f"module {serial} is mounted on" for serial in carried),
+        *(f"module {serial} is mounted {way}" for serial in unmoved for way in ("forward", "reversed")),
+    )
+    differences = [text for text in scored.topology_differences if not text.startswith(unknown)]
     if differences:
         return "; ".join(differences)
     for link in scored.links:
-        if link.parent in unknown or link.child in unknown:
+        if link.parent in unheard | unmoved or link.child in unheard:
             continue
         error, sigma = link.link_length_error_mm, link.link_length_sigma_mm or 0.0
         if error is not None and not abs(error) <= max(SIGMAS * sigma, RESOLUTION_MM):

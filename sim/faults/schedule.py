@@ -15,6 +15,7 @@ from module_agent.model.errors import UsageError
 from sim.faults.fault import KINDS, NATURES, Fault
 from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot, load_robot
+from sim.virtual_time.run import QUICK_PLAN
 
 # Shipped robots, and how many of their modules: two to four joints, and a tree.
 SMALL_ROBOTS = (
@@ -31,8 +32,8 @@ LATEST_S = 14.0
 # The share of sessions whose coordinator is told how many modules there are, as most users would.
 EXPECTING = 0.75
 SHORTEST_S, LONGEST_S = 0.02, 1.5
-# From where a joint begins to the limits of its position, at the least and at the most: the motions of a
-# short session go to half a radian, and near a limit they would be slowed down.
+# From where a joint begins, and its home, to the limits of its position, at the least and at the most: the
+# motions of a short session go to half a radian, and near a limit they would be slowed down.
 ROOM_RAD = (0.8, 1.4)
 
 
@@ -69,12 +70,13 @@ def draw(seed: int, robot: Robot | None = None) -> Schedule:
 def position_ranges(schedule: Schedule) -> dict[str, tuple[float, float]]:
     """Return the range [rad] that each module of the session is configured to stay in, by serial.
 
-    It begins within it, and what a session plans has room.
+    It contains where the joint begins and its home, and what a session plans has room about both.
     """
     ranges = {}
     for module in schedule.robot.modules:
         low, high = _stream(schedule.seed, module.serial, "range").uniform(*ROOM_RAD, 2).tolist()
-        ranges[module.serial] = (round(module.start_rad - low, 3), round(module.start_rad + high, 3))
+        ends_rad = module.start_rad, QUICK_PLAN.home_rad
+        ranges[module.serial] = (round(min(ends_rad) - low, 3), round(max(ends_rad) + high, 3))
     return ranges
 
 

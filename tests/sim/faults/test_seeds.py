@@ -25,8 +25,8 @@ def test_a_session_with_faults_violates_nothing(seed: int) -> None:
     assert report.violations == {}, f"repeat it with: x5-sim faults {report.options()}"
 
 
-@pytest.mark.parametrize("seed", [70105, 70358, 70936])
-def test_a_sick_encoder_is_named_though_its_module_is_in_protection_or_took_no_part(seed: int) -> None:
+@pytest.mark.parametrize("seed", [70358, 70936])
+def test_an_encoder_that_jumps_while_its_joint_is_held_is_named(seed: int) -> None:
     assert run_seed(draw(seed), shrinks=False).named_rightly is True
 
 

@@ -1,0 +1,82 @@
+"""What the search judges a session by: the whole robot, but for what nothing could have shown."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.recording.run_folder import RESULT
+from sim.faults import run, schedule
+from sim.faults.fault import Fault
+from sim.faults.invariants import check_folder
+from sim.faults.run import Ending, run_schedule, witness_of
+from sim.faults.schedule import SMALL_ROBOTS, Schedule, first_modules
+from sim.robot.robot_file import load_robot
+
+ARM = ("a2085_03", 3)
+
+
+def session(robot: tuple[str, int], *faults: Fault, expects: bool = True) -> Schedule:
+    name, modules = robot
+    return Schedule(3, first_modules(load_robot(name), modules), "lan", faults, expects=expects)
+
+
+def ran(one: Schedule, out: Path) -> Ending:
+    return run_schedule(one, out, witness_of(one))
+
+
+def result(out: Path) -> Any:
+    return json.loads((out / RESULT).read_text())
+
+
+@pytest.mark.parametrize("robot", SMALL_ROBOTS, ids=lambda robot: robot[0])
+def test_without_faults_every_module_is_measured_and_judged(robot: tuple[str, int], tmp_path: Path) -> None:
+    one = session(robot)
+    ending = ran(one, tmp_path / "run")
+    assert (ending.name, check_folder(tmp_path / "run", ending)) == ("result", {})
+    written = result(tmp_path / "run")
+    assert set(written["serials"]) == set(one.robot.serials)
+    # Of a joint that does not move the search would compare little.
+    assert all(module["joint_moved"] for module in written["topology"])
+
+
+def test_a_module_that_was_not_announced_is_forgiven_only_where_modules_are_not_counted(
+    tmp_path: Path,
+) -> None:
+    gone = session(ARM, Fault("agent crash", 0.0, math.inf, 2), expects=False)
+    ending = ran(gone, tmp_path / "run")
+    missing = gone.robot.serials[2]
+    assert (ending.name, ending.unheard) == ("result", {missing})
+    assert check_folder(tmp_path / "run", ending) == {}
+    found = check_folder(tmp_path / "run", ending._replace(unheard=frozenset()))
+    assert f"module {missing} was not found" in found["wrong robot"]
+
+
+def test_of_a_joint_that_its_limits_keep_still_only_what_it_carries_is_forgiven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, ranges = session(ARM), schedule.position_ranges
+    first, still, last = one.robot.serials
+    monkeypatch.setattr(run, "position_ranges", lambda each: ranges(each) | {still: (-0.1, 0.1)})
+    ending = ran(one, tmp_path / "run")
+    assert (ending.name, check_folder(tmp_path / "run", ending)) == ("result", {})
+    assert {m["serial"]: m["parent"] for m in result(tmp_path / "run")["topology"]}[last] == first
+    path = tmp_path / "run" / "truth.json"
+    truth = path.read_text()
+    # The link before it is measured by the first joint.
+    _displace(path, still)
+    assert f"link {first} - {still}" in check_folder(tmp_path / "run", ending)["wrong robot"]
+    path.write_text(truth)
+    _displace(path, last)
+    assert check_folder(tmp_path / "run", ending) == {}
+
+
+def _displace(path: Path, serial: str) -> None:
+    """Let the true robot have an IMU elsewhere, by 50 mm along each axis."""
+    truth = json.loads(path.read_text())
+    place = truth["chain"]["serials"].index(serial)
+    for row in range(3):
+        truth["chain"]["imu_home"][place][row][3] += 0.05
+    path.write_text(json.dumps(truth))
