@@ -14,7 +14,7 @@ from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender
 from coordinator.monitoring.findings import Finding
 from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from coordinator.monitoring.reference import ALARMS_PER_HOUR, Reference, build_reference
+from coordinator.monitoring.reference import ALARMS_PER_HOUR, Reference, UnsuitableBaseline, build_reference
 from coordinator.recording.recording import Recording
 from coordinator.recording.versions import Versions
 from module_agent.transport.transport import Transport
@@ -104,6 +104,11 @@ class AttendSession:
         """
         known = await self._site.compute(lambda: load_baseline(self._versions.folder))
         reference = await self._site.compute(lambda: build_reference(known))
+        if self._measurer is not None and (why := known.kinematics.suspicions):
+            raise UnsuitableBaseline(
+                f"{known.folder} is not to be believed as usual, so that no measurement could be: "
+                f"{'; '.join(why)}. Identify the robot anew, or attend it without --may-move"
+            )
         serials = reference.chain.serials
         attendant = Attendant(serials, self._measurer is not None, self._patience)
         self._say(f"attends {known.name}, version {self._versions.current_number}: {', '.join(serials)}")

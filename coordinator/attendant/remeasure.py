@@ -18,10 +18,12 @@ from coordinator.baseline.difference import difference
 from coordinator.baseline.payload import payload_plan, search_payload
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
+from coordinator.live_robot.messenger import Sender
 from coordinator.recording.versions import Versions
 from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
 from module_agent.model.errors import RobotError, named_files
+from module_agent.wire.messages import MAX_NAME
 
 # Of the motions for the inertia; with them a run lasts as long as a monitor needs to know what is normal.
 INERTIA = {"excitation": "d-optimal", "excitation_motions": 4, "excitation_s": 4.0}
@@ -96,6 +98,11 @@ class Remeasurement:
         words = (f"measured again: version {number} is the model from now on", *found.words)
         return Measured(Outcome("replaced", words), later)
 
+    def _sender(self, out: Path) -> Sender:
+        """Return a name of its own for a measurement: requests of a connection are numbered from 1 on."""
+        name, secret = self._site.sender
+        return Sender(f"{name[: MAX_NAME - len(out.name) - 1]}-{out.name}", secret)
+
     async def _run(
         self, aim: Aim, wanted: Measurement, known: BaselineRobot, out: Path
     ) -> tuple[Result, BaselineRobot]:
@@ -104,7 +111,7 @@ class Remeasurement:
         config = RunConfig(
             robot=self._site.robot,
             out=out,
-            sender=self._site.sender,
+            sender=self._sender(out),
             plan=plan,
             expect=len(wanted.modules),
             inline=self._site.inline,

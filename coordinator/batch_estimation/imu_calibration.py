@@ -105,8 +105,8 @@ class CalibrationInformation(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The recording, for messages."""
-        return f"recording {self.session[:12]}"
+        """The recording, for messages, by its trace hash as in reports."""
+        return f"recording {self.session[:16]}"
 
 
 def catalogued(serials: Sequence[str], prior: ImuPrior) -> ImuCalibration:

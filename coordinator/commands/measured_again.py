@@ -45,7 +45,7 @@ def check_robot(
     write_check(after.folder / CHECK, report)
     if write_result(json_file, report):
         _print(report)
-    end_if_suspect([*before.kinematics.suspicions, *after.kinematics.own_suspicions])
+    end_if_suspect(list(dict.fromkeys([*before.kinematics.suspicions, *after.kinematics.suspicions])))
     if report.changed:
         raise typer.Exit(EXIT_FINDING)
 
@@ -82,8 +82,8 @@ def find_payload(
     # Before the robot is moved, and before seconds of work.
     if (baseline / RESULT).is_file() and read_result(baseline).dynamics is None:
         raise UsageError(
-            f"{baseline} has no inertia, since the run had --no-dynamics: a payload is what is more than a "
-            "known inertia; identify the robot with dynamics first"
+            f"{baseline} has no inertia: its run had --no-dynamics, or ended with code 5. A payload is what "
+            "is more than a known inertia; identify the robot with dynamics first"
         )
     before = load_baseline(baseline)
     after = measured_again(before, at, again, payload_plan)
@@ -91,7 +91,7 @@ def find_payload(
     write_payload(after.folder / PAYLOAD, report)
     if write_result(json_file, report):
         typer.echo("\n".join(report.summary))
-    end_if_suspect([*before.kinematics.suspicions, *after.kinematics.own_suspicions])
+    end_if_suspect(list(dict.fromkeys([*before.kinematics.suspicions, *after.kinematics.suspicions])))
 
 
 def measured_again(

@@ -30,7 +30,7 @@ def merge(
 
     The robot may be assembled differently in every run: in another order, on another base, with further
     modules. Each link must stay with the module that it leads to. `run --measured OUT` begins with the IMUs.
-    Exit code 5: one of the runs, or of those that they began with, is suspect, by its own exit code 5.
+    Exit code 5: one of the runs, or of those that they began with, ended with code 5 itself.
     """
     if len(runs) < 2:
         raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
@@ -39,7 +39,10 @@ def merge(
     recordings = [read_calibration(file) if file.is_file() else () for file in files]
     imus = merge_calibrations(recordings)
     everything = each_once(one for run in recordings for one in run)
-    suspicions = [f"{one.name}: {why}" for one in everything for why in one.suspicions]
+    folders = {own[0].session: run.name for own, run in zip(recordings, runs, strict=True) if own}
+    suspicions = [
+        f"{folders.get(one.session, one.name)}: {why}" for one in everything for why in one.suspicions
+    ]
     merged = merge_runs([read_information(run / INFORMATION) for run in runs])
     report = merge_report(merged, imus, suspicions)
     out.mkdir(parents=True, exist_ok=True)

@@ -69,11 +69,13 @@ def monitor_robot(
         return
     if recording is not None and not recording.is_file():
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
-    reference = build_reference(load_baseline(baseline))
+    known = load_baseline(baseline)
+    reference = build_reference(known)
+    doubts = [f"{baseline} is not to be believed as usual: {why}" for why in known.kinematics.suspicions]
     monitor = Monitor(reference, alarms_per_hour)
     screen = MonitorScreen(monitor, json_file, at.quiet, _keys())
     with screen:
-        screen.report(MonitorUpdate((), (), reference.remarks))
+        screen.report(MonitorUpdate((), (), (*doubts, *reference.remarks)))
         if recording is not None:
             _monitor_file(monitor, screen, recording)
         else:

@@ -68,9 +68,7 @@ class Kinematics(NamedTuple):
     def suspicions(self) -> list[str]:
         """Why the robot is not to be believed as usual, as sentences; none of healthy robots."""
         before = (
-            f"the earlier {one.name} is used, and there {why}"
-            for one in self.measured
-            for why in one.suspicions
+            f"it began with {one.name}, and there {why}" for one in self.measured for why in one.suspicions
         )
         return [*self.own_suspicions, *before]
 

@@ -268,7 +268,9 @@ def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
         clocks=clocks,
         notes=tuple(dict.fromkeys((*kept.notes, *sampling))),
         findings=(*kept.findings, *later_findings),
-        missing=tuple(dict.fromkeys((*kept.missing, *missing_modules(recording.journal)))),
+        missing=tuple(
+            dict.fromkeys((*kept.missing, *missing_modules(recording.journal, kept.topology.serials)))
+        ),
         damage=tuple(recording.damage),
     )
 

@@ -62,7 +62,7 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
     doubts = [f"in doubt: {doubt.text}" for doubt in topology.doubts]
     notes = (*exclusion_notes(recording.journal), *silent, *still.values(), *doubts)
     dead = [text for serial, text in still.items() if serial not in excluded]
-    missing = (*missing_modules(recording.journal), *silent, *dead)
+    missing = (*missing_modules(recording.journal, topology.serials), *silent, *dead)
     return TopologyFound(topology, observations, notes, missing)
 
 

@@ -64,7 +64,9 @@ class ExcludedModules:
         for serial in sorted(self._well):
             status = self._group.status_under_lease(serial)
             if status is not None and status.state in ("fault", "expired"):
-                self._exclude(serial, f"it did not hold its joint to the end: its state is {status.state}")
+                reason = f": {status.note}" if status.note else ""
+                text = f"it did not hold its joint to the end: its state is {status.state}{reason}"
+                self._exclude(serial, text)
 
     def _exclude(self, serial: str, why: str, by_limits: bool = False) -> None:
         self.why[serial] = why

@@ -16,8 +16,15 @@ VERSION = 1
 
 
 def each_once(recordings: Iterable[CalibrationInformation]) -> tuple[CalibrationInformation, ...]:
-    """Return recordings without those that occur again, by their trace hashes: their noise counts once."""
-    return tuple({one.session: one for one in recordings}.values())
+    """Return recordings without those that occur again, by their trace hashes: their noise counts once.
+
+    Suspicions of any copy are kept: one of an earlier version tells none, and the journal is in no hash.
+    """
+    once: dict[str, CalibrationInformation] = {}
+    for one in recordings:
+        earlier = once[one.session].suspicions if one.session in once else ()
+        once[one.session] = one._replace(suspicions=tuple(dict.fromkeys((*earlier, *one.suspicions))))
+    return tuple(once.values())
 
 
 def write_calibration(path: Path, recordings: Sequence[CalibrationInformation]) -> None:

@@ -64,7 +64,9 @@ def read_information(path: Path) -> RunInformation:
         RunArraysError: no such file, another version, or not what it should be.
     """
     run = partial(_run, path.parent.name)
-    return read_arrays(path, VERSION, run, "the information of a run", "a run with dynamics")
+    return read_arrays(
+        path, VERSION, run, "the information of a run", "a run with dynamics that does not end with code 5"
+    )
 
 
 def _run(name: str, arrays: dict[str, Any]) -> RunInformation:

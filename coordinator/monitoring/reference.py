@@ -142,6 +142,9 @@ def build_reference(known: BaselineRobot) -> Reference:
     chain, recording = known.chain, known.recording
     if not recording.motions("dynamic"):
         raise UnsuitableBaseline(f"{known.folder} has no motions for inertia: it was run with --no-dynamics")
+    if not known.kinematics.dynamic:
+        why = "; ".join(known.kinematics.suspicions)
+        raise UnsuitableBaseline(f"{known.folder} does not tell the robot's inertia: {why}")
     types = tuple(recording.module_type(serial) for serial in chain.serials)
     try:
         motion = dynamic_motion(recording, known.kinematics.clocks, chain.serials, "dynamic")

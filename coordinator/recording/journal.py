@@ -3,7 +3,7 @@
 A crashed run resumes from it, and a replay reads from it the purpose of every motion.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -100,13 +100,14 @@ def exclusion_notes(journal: Sequence[JournalEvent]) -> tuple[str, ...]:
     return tuple(_took_no_part(serial, event) for serial, event in _exclusions(journal).items())
 
 
-def missing_modules(journal: Sequence[JournalEvent]) -> tuple[str, ...]:
+def missing_modules(journal: Sequence[JournalEvent], placed: Collection[str]) -> tuple[str, ...]:
     """Return a sentence on every module that is absent or at fault, so that the robot is not known whole.
 
-    A module that is configured to refuse the motion is none of them: that its joint was not moved is said.
-    One of which an older journal does not tell why counts as missing.
+    A module that is configured to refuse the motion is none of them if it is among the `placed` ones, of
+    which the tree is known: that its joint was not moved is said. One of which an older journal does not tell
+    why counts as missing.
     """
-    well = refused_by_limits(journal)
+    well = refused_by_limits(journal) & set(placed)
     return tuple(_took_no_part(s, event) for s, event in _exclusions(journal).items() if s not in well)
 
 

@@ -172,7 +172,7 @@ def _imus(result: Result) -> Section:
 
 def _torques(dynamics: DynamicsPart | None, held_out: HeldOutTorques | None) -> Section:
     if dynamics is None:
-        text = "Inertial parameters were not identified; run without --no-dynamics for them."
+        text = "Inertial parameters were not identified."
         return Section(title="Torques", blocks=(Paragraph(text=text),))
     check = dynamics.held_out
     own = check.relative_error_per_joint if check is not None else {}

@@ -150,9 +150,9 @@ def _summary(run: RunData) -> Section:
     if result.dynamics is None:
         withheld = bool(result.suspicions) and run.recording.motions("dynamic")
         items.append(
-            "Inertial parameters are not identified, as a robot that is not to be believed has none."
+            "Inertial parameters are not identified, since torques do not tell of all bodies then."
             if withheld
-            else "Inertial parameters were not asked for."
+            else "Inertial parameters were not asked for (--no-dynamics)."
         )
     else:
         items += _sure_inertia(result.dynamics)

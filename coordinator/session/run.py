@@ -543,10 +543,15 @@ def write_outputs(out: Path, identified: Identified) -> None:
     write_urdf(out / URDF, chain, phi, name, types, undetermined, identified.result.unknown_links)
     write_srdf(out / SRDF, out / URDF)
     write_hrdf(out / HRDF, chain, types, phi, name, undetermined)
+    # An earlier evaluation may have known inertia that this one withholds.
     if identified.held_out is not None:
         write_held_out(out / HELD_OUT, identified.held_out)
+    else:
+        (out / HELD_OUT).unlink(missing_ok=True)
     if identified.inertia is not None:
         write_information(out / INFORMATION, _information(out.name, identified, identified.inertia, types))
+    else:
+        (out / INFORMATION).unlink(missing_ok=True)
 
 
 def _information(

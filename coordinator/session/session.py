@@ -350,13 +350,17 @@ class Session:
         try:
             await self._step("back", "back to where it stood", back)
         except ModulesJoined as late:
-            for serial in late.serials:
-                why = f"module {serial} came when all had been measured"
-                self._note_exclusion(serial, why, by_limits=False)
+            self._note_late(late.serials)
         self._excluded.look_again()
         await self.group.release_all()
         await self._stop_keeping()
         await self.group.close_gaps()
+        self._note_late(sorted(frozenset(self._messenger.alive) - self._known))
+
+    def _note_late(self, serials: Sequence[str]) -> None:
+        for serial in serials:
+            why = f"module {serial} came when all had been measured"
+            self._note_exclusion(serial, why, by_limits=False)
 
     async def _stop_keeping(self) -> None:
         if self._keeper is not None:

@@ -66,8 +66,8 @@ def gravity_model(folder: Path) -> GravityModel:
     result = read_result(folder)
     if result.dynamics is None:
         raise BaselineError(
-            f"{folder / RESULT} has no inertial parameters, since the run had --no-dynamics; identify the "
-            "robot again"
+            f"{folder / RESULT} has no inertial parameters: the run had --no-dynamics, or ended with code 5; "
+            "identify the robot again"
         )
     return gravity_model_of_result(result)
 

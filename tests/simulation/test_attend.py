@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.attendant.workspace import Box
+from coordinator.identification.identify import identify_kinematics
+from coordinator.monitoring.reference import UnsuitableBaseline
 from tests.simulation.attended_robot import CHANGES, LAST, ROOM, Scene, remeasured
 from tests.simulation.known_arm import ARM, LOADED
 
@@ -78,6 +80,37 @@ def test_a_folder_in_which_nothing_can_be_written_ends_a_measurement_and_not_the
     assert scene.versions.current == scene.versions.folder
     # The watch went on: it could only join the network once the measurement had left it.
     assert scene.loop.now_ns >= 45e9
+
+
+def test_a_model_that_is_not_to_be_believed_is_no_reason_to_move_the_robot(
+    known_arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is measured from it would be suspect, too, and the robot moved in vain."""
+    why = "a chunk of the recording is lost"
+    monkeypatch.setattr(
+        "coordinator.baseline.baseline_robot.identify_kinematics",
+        lambda *of: identify_kinematics(*of)._replace(damage=(why,)),
+    )
+    scene = Scene(known_arm, tmp_path / "arm", ROOM)
+    with pytest.raises(UnsuitableBaseline, match=why):
+        scene.plays(5.0)
+    # Without leave to move it is attended.
+    scene = Scene(known_arm, tmp_path / "attended")
+    scene.plays(5.0)
+    assert scene.ears.heard(f"attends {ARM.name}")
+
+
+def test_a_second_measurement_is_granted_the_modules_as_the_first_was(
+    known_arm: Path, tmp_path: Path
+) -> None:
+    """Each begins a connection anew, and with it the numbers of its requests."""
+    scene = Scene(known_arm, tmp_path / "arm", ROOM)
+    scene.at(2.0, lambda: scene.robot.kill(LAST))
+    scene.at(26.0, lambda: scene.robot.boot(LAST))
+    scene.at(40.0, lambda: scene.robot.kill(LAST))
+    scene.plays(190.0)
+    history = [(entry.what, entry.version) for entry in scene.versions.history]
+    assert history == [("failed", 2), ("replaced", 3)], scene.ears.said
 
 
 def test_a_module_that_comes_back_while_the_rest_is_measured_ends_that_by_name(

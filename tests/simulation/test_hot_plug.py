@@ -249,3 +249,19 @@ def test_a_module_that_joins_when_all_is_measured_is_no_part_of_the_result_and_t
     (why,) = result.suspicions
     assert last in why
     assert "when all had been measured" in why
+
+
+def test_a_module_that_joins_when_the_others_are_released_already_is_said_too(
+    rigs: Callable[..., Rig], quick_plan: Plan, tmp_path: Path
+) -> None:
+    rig = rigs(ARM, "lan", 2)
+    *others, last = rig.serials
+    rig.kill(last)
+
+    def released() -> bool:
+        return "back to where" in rig.notes[-1] and all(rig.state(s) == "idle" for s in others)
+
+    rig.when(lambda: bool(rig.notes) and released(), lambda: rig.boot(last))
+    result = rig.session(tmp_path / "run", quick_plan, expects=False)
+    assert set(result.serials) == set(others)
+    assert [why for why in result.suspicions if "when all had been measured" in why]

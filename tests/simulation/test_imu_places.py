@@ -140,7 +140,7 @@ def test_what_begins_with_a_suspect_run_is_suspect_and_says_which(assemblies: di
     sick = before.alone._replace(missing=("wrist took no part: it was silent",))
     kinematics = identify_kinematics(after.recording, calibrations(sick, before.recording))
     assert kinematics.own_suspicions == []
-    which = f"the earlier recording {before.recording.trace_hash[:12]} is used"
+    which = f"it began with recording {before.recording.trace_hash[:16]}"
     assert kinematics.suspicions == [f"{which}, and there wrist took no part: it was silent"]
     # Torques of this recording tell of all bodies all the same, and the next run hears of the sick one once.
     assert kinematics.dynamic

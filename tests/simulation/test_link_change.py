@@ -19,7 +19,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify_kinematics
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
-from module_agent.model.errors import EXIT_FINDING
+from module_agent.model.errors import EXIT_FINDING, EXIT_SUSPECT
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.cases.link_change import LinkChange, draw_link_change, with_link_change
 from sim.robot.robot_file import Robot, load_robot
@@ -125,6 +125,22 @@ def test_the_command_says_so_and_exits_with_4(days: Days, monkeypatch: pytest.Mo
     assert written["changed"] is True
     assert [link["child"] for link in written["links"] if link["changed"]] == [days.change.child]
     assert not list(days.changed.folder.glob("*.part"))
+
+
+@pytest.mark.parametrize("days", ["thesis"], indirect=True)
+def test_a_later_run_that_began_with_a_suspect_one_ends_the_command_with_5(
+    days: Days, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its IMUs may be elsewhere than it takes them to be, and so may its links."""
+    kinematics = days.sound.kinematics
+    told = kinematics.refinement.calibration_information
+    began = kinematics._replace(measured=(told._replace(session="5eed", suspicions=("base took no part",)),))
+    later = days.sound._replace(kinematics=began)
+    runs = {days.known.folder: days.known, days.sound.folder: later}
+    monkeypatch.setattr("coordinator.commands.measured_again.load_baseline", runs.__getitem__)
+    done = CliRunner().invoke(app, ["check", str(days.known.folder), "--measured", str(days.sound.folder)])
+    assert done.exit_code == EXIT_SUSPECT
+    assert "it began with recording 5eed, and there base took no part" in " ".join(done.output.split())
 
 
 def test_modules_that_are_not_the_known_ones_are_named(days: Days) -> None:

@@ -48,6 +48,22 @@ def test_what_the_robot_grasped_meanwhile_is_found_and_written_down(known: Path,
     assert finding["since_ns"] == pytest.approx(GRASPED_S * 1e9, abs=1e9)
 
 
+def test_a_run_whose_torques_do_not_tell_of_all_bodies_is_nothing_to_compare_with(
+    known: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = load_baseline(known)
+    lacking = robot._replace(kinematics=robot.kinematics._replace(missing=("X-66666 took no part",)))
+    monkeypatch.setattr("coordinator.commands.monitor.load_baseline", lambda folder: lacking)
+    code, said = watch(str(known), "--recording", str(known / "session.mcap"))
+    assert code == 2
+    assert "does not tell the robot's inertia: X-66666 took no part" in " ".join(said.split())
+    damaged = robot._replace(kinematics=robot.kinematics._replace(damage=("a chunk is lost",)))
+    monkeypatch.setattr("coordinator.commands.monitor.load_baseline", lambda folder: damaged)
+    code, said = watch(str(known), "--recording", str(known / "session.mcap"))
+    assert code == 0
+    assert "is not to be believed as usual: a chunk is lost" in " ".join(said.split())
+
+
 def test_wrong_usage_is_answered_with_what_would_be_right(known: Path, tmp_path: Path) -> None:
     assert watch(str(tmp_path))[0] == 2
     code, findings = watch(str(known), "--recording", str(tmp_path / "none.mcap"))

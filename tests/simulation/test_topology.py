@@ -224,8 +224,9 @@ def test_a_module_that_its_limits_excluded_and_that_lets_go_of_its_joint_later_i
             arm.hosts["elbow"].modules[0].firmware._enter("fault", "winding at 121 C")
 
     recording, _ = explore(arm, on_step=overheat)
-    (why,) = missing_modules(recording.journal)
-    assert why == "elbow took no part: it did not hold its joint to the end: its state is fault"
+    (why,) = missing_modules(recording.journal, arm.serials)
+    held = "it did not hold its joint to the end: its state is fault: winding at 121 C"
+    assert why == f"elbow took no part: {held}"
 
 
 def test_where_no_module_responds_the_session_says_so(arm: Any) -> None:

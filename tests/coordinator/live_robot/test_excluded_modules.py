@@ -22,7 +22,7 @@ class _Group:
         return SimpleNamespace(status=self.status_under_lease(serial))
 
     def status_under_lease(self, serial: str) -> Any:
-        return SimpleNamespace(state=self.states[serial])
+        return SimpleNamespace(state=self.states[serial], note="")
 
 
 @pytest.fixture

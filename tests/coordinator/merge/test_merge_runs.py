@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.main import app
-from coordinator.merge.calibration_file import read_calibration, write_calibration
+from coordinator.merge.calibration_file import each_once, read_calibration, write_calibration
 from coordinator.merge.information_file import (
     RunInformation,
     read_information,
@@ -310,7 +310,8 @@ def test_the_file_holds_every_double(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "why"), [("missing", "a run with dynamics writes it"), ("junk", "is not the")]
+    ("what", "why"),
+    [("missing", "a run with dynamics that does not end with code 5 writes it"), ("junk", "is not the")],
 )
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, what: str, why: str) -> None:
     path = tmp_path / INFORMATION
@@ -359,7 +360,7 @@ def test_a_suspect_run_makes_what_it_is_merged_into_suspect(tmp_path: Path) -> N
     folders, out = [str(tmp_path / name) for name in ("well", "sick")], tmp_path / "both"
     done = CliRunner().invoke(app, ["merge", *folders, "--out", str(out)])
     assert done.exit_code == 5
-    said = "recording sick: B took no part: it was silent"
+    said = "sick: B took no part: it was silent"
     assert said in " ".join(done.output.split())
     assert json.loads((out / "merged.json").read_text())["suspicions"] == [said]
     # A merge of the merged says it, too: it is in the file that a run may begin with.
@@ -367,6 +368,15 @@ def test_a_suspect_run_makes_what_it_is_merged_into_suspect(tmp_path: Path) -> N
         (),
         ("B took no part: it was silent",),
     ]
+
+
+def test_a_recording_counts_once_and_no_copy_takes_a_suspicion_away() -> None:
+    size = 40 * len(SERIALS)
+    plain = CalibrationInformation(SERIALS, np.zeros((size, size)), np.zeros(size), "same")
+    doubted = plain._replace(suspicions=("B took no part",))
+    for order in ([plain, doubted], [doubted, plain], [doubted, plain, doubted]):
+        (one,) = each_once(order)
+        assert one.suspicions == doubted.suspicions
 
 
 def test_the_command_says_what_it_needs(tmp_path: Path) -> None:

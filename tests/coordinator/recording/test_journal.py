@@ -47,13 +47,20 @@ def test_a_module_that_refuses_by_its_limits_is_excluded_and_not_missing() -> No
     hot = exclusion_event(2, "B", "in protection", by_limits=False)
     journal = [JournalEvent.decode(event.encode()) for event in (refuses, hot)]
     assert excluded_modules(journal) == {"A": "beyond its range", "B": "in protection"}
-    assert missing_modules(journal) == ("B took no part: in protection",)
+    assert missing_modules(journal, ("A", "C")) == ("B took no part: in protection",)
+    # One of which the tree is not known is not known, well or not.
+    assert missing_modules(journal, ("C",)) == (
+        "A took no part: beyond its range",
+        "B took no part: in protection",
+    )
     # An older journal does not tell, and its module is not believed to be well.
     older = hot.model_copy(update={"by_limits": None})
-    assert missing_modules([JournalEvent.decode(older.encode())]) == ("B took no part: in protection",)
+    assert missing_modules([JournalEvent.decode(older.encode())], ("B",)) == (
+        "B took no part: in protection",
+    )
     # A resumed session has moved it.
     moved = [*journal, _event("motion", serial="B", purpose="windowed_sine")]
-    assert missing_modules(moved) == ()
+    assert missing_modules(moved, ("A", "B")) == ()
 
 
 def test_an_event_of_another_version_is_refused_in_words_of_the_field() -> None:

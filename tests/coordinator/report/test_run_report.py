@@ -17,7 +17,7 @@ from coordinator.identification.result import Result
 from coordinator.main import app
 from coordinator.recording.journal import JournalEvent, exclusion_event
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry
-from coordinator.recording.run_folder import REPORT, RESULT, SESSION
+from coordinator.recording.run_folder import HELD_OUT, INFORMATION, REPORT, RESULT, SESSION
 from coordinator.recording.session_file import SessionWriter, read_session
 from coordinator.report.document import Document, Table, figures, tables
 from coordinator.report.pages import html_page
@@ -239,8 +239,12 @@ def test_a_recording_in_which_a_module_took_no_part_ends_with_code_5_and_the_rep
     for entry in (entries[0], Entry("journal", JOURNAL_TOPIC, silent.t_ns, silent.encode()), *entries[1:]):
         writer.write(entry)
     writer.close()
+    # Of an earlier evaluation that knew inertia.
+    for name in (INFORMATION, HELD_OUT):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
     again = CliRunner().invoke(app, ["replay", str(tmp_path)])
     assert again.exit_code == EXIT_SUSPECT, again.output
+    assert not [name for name in (INFORMATION, HELD_OUT) if (tmp_path / name).exists()]
     why = "The result is not to be believed as usual: X-66666 took no part: it did not answer."
     page = (tmp_path / REPORT).read_text()
     summary = page[: page.index("<h2>Topology")]
