@@ -15,7 +15,8 @@ EXIT_CODES = {
     EXIT_USAGE: "wrong usage: an option, a path or a file cannot be used; nothing was begun",
     EXIT_LOST: "a module was lost; it is named",
     EXIT_FINDING: "done, and found something: a change, a collision, a missed bar",
-    EXIT_SUSPECT: "done, but a module is missing, sensors contradict each other or the recording is damaged",
+    EXIT_SUSPECT: "done, but a module is missing, sensors contradict each other, the recording is damaged, "
+    "or an earlier run that was used ended so",
     EXIT_INTERRUPTED: "interrupted by Ctrl-C; the robot is stopped",
 }
 
