@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from coordinator.identification.topology_observations import (
     ObservedMotions,
     observe,
@@ -24,7 +26,11 @@ from coordinator.topology.topology import (
     find_topology,
     likely_topology,
 )
+from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
+
+# A joint that turned by less than this share of its command was held, or its motor failed meanwhile.
+MIN_FOLLOWED = 0.2
 
 
 class TopologyFound(NamedTuple):
@@ -60,9 +66,10 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
     silent = [f"{s} observed no motion and is left out: its parent is not known" for s in observed.silent]
     still, excluded = _still(observed, topology), excluded_modules(recording.journal)
     doubts = [f"in doubt: {doubt.text}" for doubt in topology.doubts]
-    notes = (*exclusion_notes(recording.journal), *silent, *still.values(), *doubts)
+    halted = _halted(recording, [s for s in topology.serials if s not in still])
+    notes = (*exclusion_notes(recording.journal), *silent, *still.values(), *halted, *doubts)
     dead = [text for serial, text in still.items() if serial not in excluded]
-    missing = (*missing_modules(recording.journal, topology.serials), *silent, *dead)
+    missing = (*missing_modules(recording.journal, topology.serials), *silent, *dead, *halted)
     return TopologyFound(topology, observations, notes, missing)
 
 
@@ -95,6 +102,32 @@ def _usable(observed: ObservedMotions) -> tuple[dict[tuple[str, str], MotionObse
     """Return the observations of modules that are not silent, and the joints that did not move."""
     left = {p: o for p, o in observed.observations.items() if p[0] not in observed.silent}
     return left, [s for s in observed.unmoved if s not in observed.silent]
+
+
+def _halted(recording: Recording, joints: Sequence[str]) -> list[str]:
+    """Return a sentence on every last motion of a joint that did not follow its command.
+
+    It may have moved in an earlier one, so that the topology is known; of what it carries nothing is then.
+    """
+    sentences = []
+    for event in recording.latest_motions("constant", "windowed_sine"):
+        if event.serial not in joints or event.motion is None or event.motion.end_row is None:
+            continue
+        rows = recording.rows(event.serial, event.motion.start_row, event.motion.end_row)
+        turned_rad, wanted_rad = (_span(rows[name]) for name in ("position_rad", "position_command_rad"))
+        if turned_rad < MIN_FOLLOWED * wanted_rad:
+            sentences.append(
+                f"joint {event.serial} turned by {turned_rad:.2g} rad in its {event.purpose} motion, "
+                f"{wanted_rad:.2g} rad were commanded: its motor is dead, or something held it; what it "
+                "carries is not known"
+            )
+    return sentences
+
+
+def _span(values: Array) -> float:
+    """Return the range of the finite values, 0 without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if finite.size else 0.0
 
 
 def _still(observed: ObservedMotions, topology: Topology) -> dict[str, str]:

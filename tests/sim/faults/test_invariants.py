@@ -42,6 +42,15 @@ def test_without_faults_every_module_is_measured_and_judged(robot: tuple[str, in
     assert all(module["joint_moved"] for module in written["topology"])
 
 
+def test_a_joint_that_moves_slowly_and_is_held_in_its_sine_makes_the_result_suspect(tmp_path: Path) -> None:
+    """Of the link that it turns the sine tells nothing, though the topology is known."""
+    held = session(("thesis_171_vertical", 2), Fault("motor stall", 6.2, math.inf, 0))
+    ending = ran(held, tmp_path / "run")
+    assert ending.name == "suspect"
+    assert f"joint {held.robot.serials[0]} turned by" in ending.text
+    assert "in its windowed_sine motion" in ending.text
+
+
 def test_a_module_that_was_not_announced_is_forgiven_only_where_modules_are_not_counted(
     tmp_path: Path,
 ) -> None:
