@@ -45,7 +45,7 @@ def check_robot(
     write_check(after.folder / CHECK, report)
     if write_result(json_file, report):
         _print(report)
-    end_if_suspect(list(dict.fromkeys([*before.kinematics.suspicions, *after.kinematics.suspicions])))
+    end_if_suspect([*before.kinematics.suspicions, *after.kinematics.suspicions])
     if report.changed:
         raise typer.Exit(EXIT_FINDING)
 
@@ -91,7 +91,7 @@ def find_payload(
     write_payload(after.folder / PAYLOAD, report)
     if write_result(json_file, report):
         typer.echo("\n".join(report.summary))
-    end_if_suspect(list(dict.fromkeys([*before.kinematics.suspicions, *after.kinematics.suspicions])))
+    end_if_suspect([*before.kinematics.suspicions, *after.kinematics.suspicions])
 
 
 def measured_again(

@@ -47,9 +47,11 @@ def fail(text: object, exit_code: int) -> NoReturn:
 
 
 def end_if_suspect(suspicions: Sequence[str]) -> None:
-    """End the command with `EXIT_SUSPECT` if a result is not to be believed as usual, and say why."""
+    """End the command with `EXIT_SUSPECT` if a result is not to be believed as usual; each reason once."""
     if suspicions:
-        fail(f"the result is not to be believed as usual: {'; '.join(suspicions)}", EXIT_SUSPECT)
+        fail(
+            f"the result is not to be believed as usual: {'; '.join(dict.fromkeys(suspicions))}", EXIT_SUSPECT
+        )
 
 
 def ending(error: BaseException) -> RobotError:
