@@ -5,7 +5,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from coordinator.recording.run_folder import RESULT
 from sim.faults import run, schedule
@@ -80,6 +82,45 @@ def test_of_a_joint_that_its_limits_keep_still_only_what_it_carries_is_forgiven(
     path.write_text(truth)
     _displace(path, last)
     assert check_folder(tmp_path / "run", ending) == {}
+
+
+def test_a_wrong_axis_is_a_wrong_robot_though_every_length_is_right(tmp_path: Path) -> None:
+    one = session(ARM)
+    ending = ran(one, tmp_path / "run")
+    path = tmp_path / "run" / "truth.json"
+    first, second = one.robot.serials[:2]
+    truth = json.loads(path.read_text())
+    chain = {name: np.array(truth["chain"][name]) for name in ("axis", "point", "imu_home")}
+    k, child = (truth["chain"]["serials"].index(serial) for serial in (first, second))
+    axis = chain["axis"][k]
+    arm = chain["imu_home"][child, :3, 3] - chain["point"][k]
+    along = axis * (axis @ arm)
+    # About the perpendicular to the IMU, at its foot: the way across the axis stays what it is.
+    across = (arm - along) / np.linalg.norm(arm - along)
+    truth["chain"]["point"][k] = (chain["point"][k] + along).tolist()
+    truth["chain"]["axis"][k] = Rotation.from_rotvec(np.radians(4.0) * across).apply(axis).tolist()
+    path.write_text(json.dumps(truth))
+    found = check_folder(tmp_path / "run", ending)["wrong robot"]
+    assert f"link {first} - {second} has its axis" in found
+
+
+def test_a_wrong_zero_of_an_encoder_is_a_wrong_robot_though_every_link_is_right(tmp_path: Path) -> None:
+    one = session(ARM)
+    ending = ran(one, tmp_path / "run")
+    path = tmp_path / "run" / "truth.json"
+    truth = json.loads(path.read_text())
+    chain, (_, second, last) = truth["chain"], one.robot.serials
+    k, leaf = (chain["serials"].index(serial) for serial in (second, last))
+    axis, point = np.array(chain["axis"][k]), np.array(chain["point"][k])
+    turn = Rotation.from_rotvec(np.radians(6.0) * axis)
+    home = np.array(chain["imu_home"][leaf])
+    home[:3, 3] = point + turn.apply(home[:3, 3] - point)
+    home[:3, :3] = turn.as_matrix() @ home[:3, :3]
+    chain["imu_home"][leaf] = home.tolist()
+    chain["axis"][leaf] = turn.apply(chain["axis"][leaf]).tolist()
+    chain["point"][leaf] = (point + turn.apply(np.array(chain["point"][leaf]) - point)).tolist()
+    path.write_text(json.dumps(truth))
+    assert "the tips are turned by" in check_folder(tmp_path / "run", ending)["wrong robot"]
 
 
 def _displace(path: Path, serial: str) -> None:
