@@ -13,7 +13,7 @@ from sim.scoring.score import LinkScore, Score, score
 SIGMAS = 5.0
 RESOLUTION_MM = 2.0
 # Axes and tips have no claim of one number. Of 95 sessions with the right robot the axes err by 0.5 degrees
-# at the most, the tips by 0.6 degrees and 7 mm; the least jump of an encoder turns all beyond it by 6 degrees.
+# at most, the tips by 0.6 degrees and 7 mm. The least jump of an encoder turns all beyond it by 6 degrees.
 AXIS_DEG = 2.0
 TIP_DEG, TIP_MM = 3.0, 20.0
 
