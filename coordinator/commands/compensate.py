@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed, TakeSuspect
 from coordinator.commands.views.compensation import CompensationView
 from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.runtime.command_line import fail, with_options
@@ -41,6 +41,7 @@ def compensate_robot(
     back: Annotated[
         bool, typer.Option("--back/--no-back", help="Return to the start position at the end [yes].")
     ] = True,
+    suspect: TakeSuspect = False,
     speed: Speed = 1.0,
     json_file: JsonFile = None,
 ) -> None:
@@ -51,7 +52,7 @@ def compensate_robot(
     return, but is released where it is. Exit codes: 0 also after Ctrl-C; 1 the start was refused, or a limit
     was exceeded; others as of `run`.
     """
-    model = gravity_model(baseline)
+    model = gravity_model(baseline, suspect)
     place = at.place(model.robot)
     most, kind = min((max_damping_nm_s_rad(module_type(name)), name) for name in set(model.types))
     _check("rate", rate, MIN_RATE_HZ, MAX_RATE_HZ, "Hz")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed, TakeSuspect
 from coordinator.live_robot.connection import new_sender, open_connection
 from coordinator.runtime.command_line import in_a_folder, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
@@ -47,6 +47,7 @@ def follow(
         Path | None,
         typer.Option(help="JSON file of the result [follow.json in the folder].", callback=in_a_folder),
     ] = None,
+    suspect: TakeSuspect = False,
     speed: Speed = 1.0,
     json_file: JsonFile = None,
 ) -> None:
@@ -56,7 +57,7 @@ def follow(
     and calculated torque of the whole motion are checked first. Ctrl-C stops all modules. Exit codes: 0 done,
     1 the robot refused the motion, or lost track of it; others as of `run`.
     """
-    model = gravity_model(baseline)
+    model = gravity_model(baseline, suspect)
     place = at.place(model.robot)
     plan = FollowPlan(_modes(mode), rate, drive, max_error, travel)
     _check("rate", rate, MIN_RATE_HZ, MAX_RATE_HZ, "Hz")

@@ -24,6 +24,9 @@ BaselineFolder = Annotated[Path, typer.Argument(help="Folder of an earlier run o
 DynamicsFolder = Annotated[
     Path, typer.Argument(help="Folder of an earlier run of this robot with dynamics, its baseline.")
 ]
+TakeSuspect = Annotated[
+    bool, typer.Option("--suspect", help="Move by a model too whose run ended with code 5.")
+]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
 Expect = Annotated[
     int | None, typer.Option(min=1, help="Wait until this many modules answer; fewer are a failure.")

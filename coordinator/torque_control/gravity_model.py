@@ -54,20 +54,25 @@ def read_result(folder: Path) -> Result:
         raise BaselineError(f"{path} is no result of a run: {place}: {first['msg']}") from error
 
 
-def gravity_model(folder: Path) -> GravityModel:
+def gravity_model(folder: Path, suspect: bool = False) -> GravityModel:
     """Read the gravity model of a robot from the folder of a run.
 
     The parameters are the physically consistent ones where the result has them: they stay plausible in poses
-    that were never measured.
+    that were never measured. suspect: take a result too that is not to be believed as usual.
 
     Raises:
-        BaselineError: the folder holds no result, or one without dynamics.
+        BaselineError: the folder holds no result, one without dynamics, or one that is suspect.
     """
     result = read_result(folder)
     if result.dynamics is None:
         raise BaselineError(
             f"{folder / RESULT} has no inertial parameters: the run had --no-dynamics, or ended with code 5; "
             "identify the robot again"
+        )
+    if result.suspicions and not suspect:
+        raise BaselineError(
+            f"{folder / RESULT} is not to be believed as usual: {'; '.join(result.suspicions)}. Identify the "
+            "robot again, or move it by this model nevertheless, with --suspect"
         )
     return gravity_model_of_result(result)
 

@@ -1,4 +1,4 @@
-"""What `x5-coordinator float` refuses, and what is to be seen of a float."""
+"""What `x5-coordinator compensate` refuses, and what is to be seen of it."""
 
 import io
 import json
@@ -58,12 +58,13 @@ def test_wrong_usage_is_answered_with_what_is_right(
     assert words in done.output
 
 
-def test_a_folder_that_does_not_tell_the_weight_is_wrong_usage(
+def test_a_folder_that_does_not_tell_the_weight_for_certain_is_wrong_usage(
     tmp_path: Path, known_folder: Callable[..., Path]
 ) -> None:
     for folder, words in (
         (tmp_path / "nowhere", "holds no result.json: give the folder of a run that has finished"),
         (known_folder("a2085_03", dynamics=None), "the run had --no-dynamics"),
+        (known_folder("tree_y", suspicions=["its IMU is sick"]), "its IMU is sick. Identify the robot again"),
     ):
         done = CliRunner().invoke(app, ["compensate", str(folder)])
         assert done.exit_code == 2, done.output

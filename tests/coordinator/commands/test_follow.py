@@ -43,6 +43,12 @@ def test_a_run_without_dynamics_and_another_robots_motion_are_refused(
     done = CliRunner().invoke(app, ["follow", str(known_folder("a2085_03", dynamics=None)), *motion])
     assert done.exit_code == 2
     assert "has no inertial parameters" in done.output
+    suspect = str(known_folder("a2085_03", suspicions=["its IMU is sick"]))
+    done = CliRunner().invoke(app, ["follow", suspect, *motion])
+    assert done.exit_code == 2
+    assert "not to be believed as usual: its IMU is sick. Identify the robot again" in done.output
+    done = CliRunner().invoke(app, ["follow", suspect, *motion, "--suspect"])
+    assert "joint knee is not one of the robot's" in done.output
     done = CliRunner().invoke(app, ["follow", str(tmp_path), *motion])
     assert done.exit_code == 2
     assert "holds no result.json" in done.output

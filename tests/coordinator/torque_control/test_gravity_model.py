@@ -28,7 +28,7 @@ def identified() -> Identified:
     """Return what a short session on an upright arm finds out."""
     plan = Plan(imu="calibrated", sine_centre_s=1.4, sine_sigma_s=0.5, rest_s=1.0, dynamic_repeats=2)
     robot = load_robot("thesis_484_vertical")
-    return identify(record_session(VirtualSettings(robot, PROFILES["lan"], 3), plan))
+    return identify(record_session(VirtualSettings(robot, PROFILES["lan"], 3, "x5"), plan))
 
 
 def written(folder: Path, **changes: object) -> Path:
@@ -87,6 +87,13 @@ def test_a_run_without_dynamics_does_not_tell_the_weight(tmp_path: Path) -> None
         BaselineError, match=r"result.json has no inertial parameters: the run had --no-dynamics"
     ):
         gravity_model(written(tmp_path, dynamics=None))
+
+
+def test_a_model_that_is_not_believed_is_taken_only_on_demand(tmp_path: Path) -> None:
+    folder = written(tmp_path, suspicions=["X-1: its IMU is sick"])
+    with pytest.raises(BaselineError, match=r"not to be believed as usual: X-1: its IMU is sick\. Identify"):
+        gravity_model(folder)
+    assert list(gravity_model(folder, suspect=True).chain.serials) == identified().result.serials
 
 
 def test_a_folder_without_a_result_or_with_another_file_in_its_place_is_refused(tmp_path: Path) -> None:
