@@ -27,7 +27,7 @@ from coordinator.report.plots import MissingPlots
 from coordinator.report.run_report import write_report
 from coordinator.runtime.command_line import ENDINGS, end_if_suspect, ending, fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
-from coordinator.runtime.terminal import Terminal, new_table, write_result
+from coordinator.runtime.terminal import Terminal, figure, new_table, write_result
 from coordinator.session.run import Run, RunConfig, write_outputs
 from coordinator.viewer.targets import SERVE_PORT, viewer_choice
 from module_agent.model.errors import UsageError
@@ -190,9 +190,8 @@ def print_result(result: Result, terminal: Terminal) -> None:
     """Print the links, what is not identifiable, and how well the inertial parameters predict."""
     table = new_table(f"{result.robot}: links", "parent | child | link length [mm] | +-")
     for link in result.links:
-        table.add_row(
-            link.parent, link.child, f"{link.link_length_mm:.1f}", f"{link.link_length_sigma_mm:.1f}"
-        )
+        sigma = figure(link.link_length_sigma_mm, ".1f")
+        table.add_row(link.parent, link.child, f"{link.link_length_mm:.1f}", sigma)
     terminal.console.print(table)
     for item in result.unresolved:
         terminal.note(f"not identifiable: {item.summary}")

@@ -93,7 +93,8 @@ class Kinematics(NamedTuple):
                 continue
             length, sigma = 1e3 * self.fit.link_length_m[k], 1e3 * self.fit.link_length_sigma_m[k]
             on = f"{serial} on {self.topology.serials[parent]}{mounted}"
-            lines.append(f"{on}: {length:.1f} +- {sigma:.1f} mm")
+            known = f"{length:.1f} +- {sigma:.1f} mm" if np.isfinite(sigma) else "its length is not known"
+            lines.append(f"{on}: {known}")
         return lines + [finding.summary for finding in self.findings]
 
 

@@ -35,12 +35,15 @@ class ChainPart(Part):
 
 
 class LinkPart(Part):
-    """The thesis' link length: perpendicular distance from the parent's axis to the child's IMU at q = 0."""
+    """The thesis' link length: perpendicular distance from the parent's axis to the child's IMU at q = 0.
+
+    The sigma is None if nothing that was observed determines the length.
+    """
 
     parent: str
     child: str
     link_length_mm: float
-    link_length_sigma_mm: float
+    link_length_sigma_mm: float | None
 
 
 class UnknownPart(Part):

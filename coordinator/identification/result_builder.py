@@ -124,7 +124,7 @@ def _links(fit: ChainEstimate) -> list[LinkPart]:
             parent=chain.serials[chain.parent[k]],
             child=chain.serials[k],
             link_length_mm=1e3 * float(fit.link_length_m[k]),
-            link_length_sigma_mm=1e3 * float(fit.link_length_sigma_m[k]),
+            link_length_sigma_mm=finite(1e3 * float(fit.link_length_sigma_m[k])),
         )
         for k in chain.linked
     ]

@@ -10,6 +10,10 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import skew
 from module_agent.model.read_only import frozen
 
+# How much an unresolved direction of one metre or radian changes a length that depends on it, at least [m].
+# It changes the others by the noise of the null space, some 1e-8.
+HIDDEN_SLOPE = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class ChainEstimate:
@@ -34,7 +38,7 @@ class ChainEstimate:
 
     @cached_property
     def _link_lengths(self) -> tuple[Array, Array]:
-        return link_lengths(self.chain, self.covariance)
+        return link_lengths(self.chain, self.covariance, self.null_basis)
 
     @property
     def link_length_m(self) -> Array:
@@ -43,14 +47,15 @@ class ChainEstimate:
 
     @property
     def link_length_sigma_m(self) -> Array:
-        """(n,) one standard deviation of `link_length_m`."""
+        """(n,) one standard deviation of `link_length_m`; infinite where no observation resolves it."""
         return self._link_lengths[1]
 
 
-def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
+def link_lengths(chain: Chain, covariance: Array, null_basis: Array | None = None) -> tuple[Array, Array]:
     """Return the lengths (n,) [m] of `ChainEstimate.link_length_m` and their sigmas; NaN for roots.
 
-    Where the length is zero it has no slope; the sigma is then that of the place across the axis.
+    Where the length is zero it has no slope; the sigma is then that of the place across the axis. It is
+    infinite where a direction of the null space changes the length, as the covariance leaves these out.
     """
     length, sigma = np.full((2, len(chain.serials)), np.nan)
     for k in chain.linked:
@@ -67,4 +72,6 @@ def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
         outward = radial[None, :] / length[k] if length[k] > 1e-6 else across
         spread = outward @ slope @ covariance @ slope.T @ outward.T
         sigma[k] = float(np.sqrt(np.trace(spread)))
+        if null_basis is not None and np.linalg.norm(outward @ slope @ null_basis) > HIDDEN_SLOPE:
+            sigma[k] = np.inf
     return frozen(length), frozen(sigma)

@@ -95,7 +95,7 @@ def _links(result: Result) -> Section:
             Column(name="± 95 %", unit="mm", form=".2f"),
         ),
         [
-            (link.parent, link.child, link.link_length_mm, HALF_95 * link.link_length_sigma_mm)
+            (link.parent, link.child, link.link_length_mm, _half_95(link.link_length_sigma_mm))
             for link in result.links
         ],
     )
@@ -112,12 +112,16 @@ def _links(result: Result) -> Section:
     for one in result.transforms:
         rows.append([one.parent, one.child])
         for value, sigma in zip(one.values, one.sigma, strict=True):
-            rows[-1] += [value, None if sigma is None else HALF_95 * sigma]
+            rows[-1] += [value, _half_95(sigma)]
     poses = Table.of("Pose of the child's mounting face in the parent's moved face", columns, rows)
-    dash = Paragraph(text="A dash instead of an interval: part of this parameter cannot be known, see below.")
+    dash = Paragraph(text="A dash instead of an interval: part of this figure cannot be known, see below.")
     if not result.links:
         return Section(title="Links", blocks=(Paragraph(text="A single module has no links."),))
     return Section(title="Links", blocks=(lengths, poses, dash))
+
+
+def _half_95(sigma: float | None) -> float | None:
+    return None if sigma is None else HALF_95 * sigma
 
 
 def _axes(result: Result) -> Section:

@@ -144,7 +144,8 @@ def _summary(run: RunData) -> Section:
         return Section(title="Summary", blocks=tuple(blocks))
     items = [f"The result is not to be believed as usual: {why}." for why in result.suspicions]
     items.append(sure_topology(result))
-    spread = [HALF_95 * link.link_length_sigma_mm for link in result.links]
+    sigmas = [link.link_length_sigma_mm for link in result.links]
+    spread = [HALF_95 * sigma for sigma in sigmas if sigma is not None]
     if spread:
         items.append(f"{_links_known(len(spread))} within ± {_from_to(min(spread), max(spread))} mm (95 %).")
     if result.dynamics is None:

@@ -152,7 +152,9 @@ def _sigmas_off(robot: Robot, kinematics: Kinematics, recording: Recording) -> t
     ]:
         errors = link_errors(chain, truth, child)
         own = fit.chain.serials.index(truth.serials[child])
-        off.append(np.inf if errors is None else abs(errors.length_m) / float(fit.link_length_sigma_m[own]))
+        sigma_m = float(fit.link_length_sigma_m[own])
+        # A length of which the result says nothing counts as one that it says wrongly.
+        off.append(np.inf if errors is None or np.isinf(sigma_m) else abs(errors.length_m) / sigma_m)
     return tuple(off)
 
 

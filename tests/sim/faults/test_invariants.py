@@ -14,7 +14,7 @@ from sim.faults import run, schedule
 from sim.faults.fault import Fault
 from sim.faults.invariants import check_folder
 from sim.faults.run import Ending, run_schedule, witness_of
-from sim.faults.schedule import SMALL_ROBOTS, Schedule, first_modules
+from sim.faults.schedule import SMALL_ROBOTS, Schedule, draw, first_modules
 from sim.robot.robot_file import load_robot
 
 ARM = ("a2085_03", 3)
@@ -51,6 +51,13 @@ def test_a_joint_that_moves_slowly_and_is_held_in_its_sine_makes_the_result_susp
     assert ending.name == "suspect"
     assert f"joint {held.robot.serials[0]} turned by" in ending.text
     assert "in its windowed_sine motion" in ending.text
+
+
+def test_of_a_link_that_no_motion_showed_no_sigma_is_claimed(tmp_path: Path) -> None:
+    """Its joint was held in every motion; what stands for its length is the initial guess."""
+    ending = ran(draw(110184), tmp_path / "run")
+    assert ending.name == "suspect"
+    assert [link["link_length_sigma_mm"] for link in result(tmp_path / "run")["links"]] == [None]
 
 
 def test_a_module_that_was_not_announced_is_forgiven_only_where_modules_are_not_counted(

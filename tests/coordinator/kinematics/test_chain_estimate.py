@@ -1,0 +1,47 @@
+"""What is claimed of a link's length: no number where nothing that was observed tells it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.kinematics.assembly import assemble
+from coordinator.kinematics.chain_estimate import ChainEstimate, link_lengths
+from module_agent.model.chain import Array
+from module_agent.model.perturbation import apply_perturbation
+
+
+def estimate(robots: Any, seed: int) -> ChainEstimate:
+    chain, types = robots.random(seed, joints=4, serial=True)
+    positions = robots.positions(chain, seed)
+    pairs, rests = robots.observe(chain, positions), [robots.rest(chain, positions[0])]
+    found: ChainEstimate = assemble(robots.topology(chain), types, pairs, rests).estimate
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_length_is_known_along_every_gauge_freedom_of_a_robot_that_moved(robots: Any, seed: int) -> None:
+    found = estimate(robots, seed)
+    assert found.null_basis.shape[1] > 0
+    assert np.isfinite(found.link_length_sigma_m[1:]).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_length_has_no_sigma_exactly_if_an_unresolved_direction_changes_it(robots: Any, seed: int) -> None:
+    found = estimate(robots, seed)
+    rng = np.random.default_rng(seed)
+    direction = np.zeros((4, 6))
+    # One module is displaced, so that the links at both its ends change, and those of the others do not.
+    direction[2] = rng.normal(size=6)
+    direction /= np.linalg.norm(direction)
+    hidden = replace(found, null_basis=direction.reshape(-1, 1))
+    moved = apply_perturbation(found.chain, 1e-6 * direction.ravel())
+    slope = np.abs(_lengths(moved) - found.link_length_m)[1:] / 1e-6
+    assert np.array_equal(np.isinf(hidden.link_length_sigma_m[1:]), slope > 1e-3)
+    assert np.array_equal(np.isinf(hidden.link_length_sigma_m[1:]), [False, True, True])
+    np.testing.assert_array_equal(hidden.link_length_m, found.link_length_m)
+
+
+def _lengths(chain: Any) -> Array:
+    return link_lengths(chain, np.zeros((24, 24)))[0]
