@@ -9,7 +9,7 @@ import pytest
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, LeaseRequest
-from sim.faults.plant_witness import LIFETIME_NS, PlantWitness
+from sim.faults.plant_witness import LIFETIME_NS, PlantWitness, _Usual
 from sim.virtual_time.quiet_run import ASKED, SEEN_ROWS
 from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM, Q_RAD, QD_RAD_S
 
@@ -172,3 +172,29 @@ def test_no_motor_is_driven_for_longer_than_a_lifetime_while_its_winding_is_too_
             assert scene.looked(ticks, scene.now_ns) == set()
     assert hot.looked(seen[:1], hot.now_ns) == {"driven too hot"}
     assert warm.looked(seen[:1], warm.now_ns) == set()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_look_at_all_ticks_at_once_passes_nothing_that_the_checks_would_find(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Values about their limits, some not a number, in several calls: the same with and without it."""
+    rng = np.random.default_rng(seed)
+    calls = []
+    for _ in range(12):
+        seen = np.zeros((int(rng.integers(1, 40)), SEEN_ROWS, 1))
+        driven = bool(rng.random() < 0.3)
+        seen[:, Q_RAD] = rng.uniform(-1.1, 0.6) if driven else rng.uniform(-0.9, 0.4)
+        seen[:, QD_RAD_S] = rng.uniform(-3.0, 3.0)
+        seen[:, PLANT_MOTOR_RAD_S] = rng.uniform(0.0, 1.9 if driven else 1.0)
+        seen[:, PLANT_PWM] = seen[:, ASKED] = rng.uniform(-1.0, 1.0)
+        if rng.random() < 0.1:
+            seen[-1, rng.choice([ASKED, PLANT_MOTOR_RAD_S, Q_RAD])] = rng.choice([np.nan, 1.01, -20.0])
+        calls.append(seen)
+    quick, thorough = armed(), armed()
+    with monkeypatch.context() as patch:
+        nothing_usual = _Usual(np.zeros((3, 1)), np.full((3, 1), -1.0))
+        patch.setattr(thorough.witness, "_usual", nothing_usual)
+        found = [(quick.looked(seen, quick.now_ns), thorough.looked(seen, quick.now_ns)) for seen in calls]
+    assert all(by_quick == by_thorough for by_quick, by_thorough in found)
+    assert quick.witness.violations == thorough.witness.violations
