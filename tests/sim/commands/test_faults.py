@@ -71,6 +71,18 @@ def test_seeds_without_violation_end_with_zero() -> None:
     assert "1 seeds, 0 with violations" in found.output
 
 
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize(
+    ("options", "expects"), [(["--expect"], {True}), (["--no-expect"], {False}), ([], {True, False})]
+)
+def test_whether_modules_are_counted_is_drawn_or_chosen(
+    tmp_path: Path, options: list[str], expects: set[bool]
+) -> None:
+    document = tmp_path / "faults.json"
+    CliRunner().invoke(app, ["faults", "--seeds", "0..19", "--no-shrink", "--json", str(document), *options])
+    assert {one["expects"] for one in json.loads(document.read_text())["reports"]} == expects
+
+
 def test_a_dask_cluster_finds_what_this_process_finds(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
