@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,28 +17,46 @@ MAX_MEASUREMENTS = 3
 BETWEEN_S = 0.03
 
 
+class _Counted(NamedTuple):
+    """The last row of the latest boot of a module."""
+
+    boot: int
+    end_row: int
+
+    @classmethod
+    def of(cls, group: ModuleGroup, serial: str) -> "_Counted":
+        record = group.module(serial)
+        return cls(record.boot, record.rows.end_row)
+
+    def rows_since(self, before: "_Counted") -> int:
+        """Return how many rows have come; a boot counts its rows from zero."""
+        return self.end_row - before.end_row if self.boot == before.boot else self.end_row
+
+
 async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
     """Measure rates and round trips of all modules and note them.
 
     Raises:
         UnfitLink: after `MAX_MEASUREMENTS`, feedback is lost, or commands would be too old on arrival.
     """
-    before = {serial: group.module(serial).rows.end_row for serial in group.serials}
+    before = {serial: _Counted.of(group, serial) for serial in group.serials}
     start_ns = clock()
     for number in range(1, MAX_MEASUREMENTS + 1):
         end_ns = start_ns + number * int(seconds * 1e9)
         await gather_all(_ask_until(group, serial, clock, end_ns) for serial in group.serials)
         span_s = (clock() - start_ns) / 1e9
-        rates = {s: (group.module(s).rows.end_row - before[s]) / span_s for s in group.serials}
+        now = {serial: _Counted.of(group, serial) for serial in group.serials}
+        rates = {s: now[s].rows_since(before[s]) / span_s for s in group.serials}
         faults = [fault for s in group.serials if (fault := _fault(group, s, rates[s]))]
         if not faults:
             break
     for serial in group.serials:
-        median, most = (float(np.percentile(_trips_ms(group, serial), share)) for share in (50, 95))
-        note(
-            f"{serial} ({group.info(serial).module_type}): {rates[serial]:.0f} rows/s, round trip "
-            f"{median:.2f} ms, 95 % {most:.2f} ms"
-        )
+        if trips_ms := _trips_ms(group, serial):
+            median, most = (float(np.percentile(trips_ms, share)) for share in (50, 95))
+            note(
+                f"{serial} ({group.info(serial).module_type}): {rates[serial]:.0f} rows/s, round trip "
+                f"{median:.2f} ms, 95 % {most:.2f} ms"
+            )
     if faults:
         raise UnfitLink(faults[0])
 
@@ -54,12 +73,18 @@ def _trips_ms(group: ModuleGroup, serial: str) -> list[float]:
 
 def _fault(group: ModuleGroup, serial: str, rate: float) -> str:
     info = group.info(serial)
+    trips_ms = _trips_ms(group, serial)
+    if not trips_ms:
+        return (
+            f"unfit: module {serial} booted anew while the link was checked, or a second module has its "
+            "serial: no answer is of the boot that was heard of last; look for a second agent, start again"
+        )
     if rate < 0.5 * info.feedback_rate_hz:
         return (
             f"unfit: module {serial} delivers {rate:.0f} rows/s of {info.feedback_rate_hz:.0f}; "
             "check the network and the load of its machine"
         )
-    slow_ms, life_ms = np.percentile(_trips_ms(group, serial), 100.0 * FIT_FRACTION), info.lifetime_ns / 1e6
+    slow_ms, life_ms = np.percentile(trips_ms, 100.0 * FIT_FRACTION), info.lifetime_ns / 1e6
     if slow_ms > 0.5 * life_ms:
         return (
             f"unfit: of the round trips to module {serial} one in five takes more than {slow_ms:.0f} ms, "
