@@ -11,8 +11,8 @@ from module_agent.model.perturbation import skew
 from module_agent.model.read_only import frozen
 
 # How much an unresolved direction of one metre or radian changes a length that depends on it, at least [m].
-# It changes the others by the noise of the null space, some 1e-8.
-HIDDEN_SLOPE = 1e-3
+# Named ones change no length at all, and the rest changes others by the errors of the fit.
+HIDDEN_SLOPE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,11 @@ class ChainEstimate:
 
     @cached_property
     def _link_lengths(self) -> tuple[Array, Array]:
-        return link_lengths(self.chain, self.covariance, self.null_basis)
+        nothing = np.zeros((len(self.covariance), 0))
+        # The named motions, not the null vectors of the fit, which its errors turn and mix: the
+        # heading of a robot whose joint is vertical is that about gravity, a degree or two off the axis.
+        hidden = (item.directions / np.linalg.norm(item.directions, axis=0) for item in self.unresolved)
+        return link_lengths(self.chain, self.covariance, np.concatenate([nothing, *hidden], axis=1))
 
     @property
     def link_length_m(self) -> Array:

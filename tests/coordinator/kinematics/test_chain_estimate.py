@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coordinator.kinematics.assembly import assemble
-from coordinator.kinematics.chain_estimate import ChainEstimate, link_lengths
+from coordinator.kinematics.chain_estimate import HIDDEN_SLOPE, ChainEstimate, link_lengths
 from module_agent.model.chain import Array
 from module_agent.model.perturbation import apply_perturbation
 
@@ -38,9 +38,24 @@ def test_a_length_has_no_sigma_exactly_if_an_unresolved_direction_changes_it(rob
     hidden = replace(found, null_basis=direction.reshape(-1, 1))
     moved = apply_perturbation(found.chain, 1e-6 * direction.ravel())
     slope = np.abs(_lengths(moved) - found.link_length_m)[1:] / 1e-6
-    assert np.array_equal(np.isinf(hidden.link_length_sigma_m[1:]), slope > 1e-3)
+    assert np.array_equal(np.isinf(hidden.link_length_sigma_m[1:]), slope > HIDDEN_SLOPE)
     assert np.array_equal(np.isinf(hidden.link_length_sigma_m[1:]), [False, True, True])
     np.testing.assert_array_equal(hidden.link_length_m, found.link_length_m)
+
+
+def test_a_heading_that_is_not_quite_about_the_joint_leaves_the_length_known(robots: Any) -> None:
+    """The null space of a short motion is that about gravity, of which the axis is not known to a degree."""
+    found = estimate(robots, 0)
+    axis, point = found.chain.axis[1], found.chain.point[1]
+    aside = np.cross(axis, found.chain.imu_home[2, :3, 3] - point)
+    turned = axis + np.radians(2.0) * aside / np.linalg.norm(aside)
+    twist = np.concatenate([turned, np.cross(point, turned)])
+    direction = np.concatenate([np.zeros(12), twist, twist])[:, None]
+    heading = replace(found, null_basis=direction / np.linalg.norm(direction))
+    assert [item.kind for item in heading.unresolved] == ["rotation_about_axis"]
+    moved = apply_perturbation(found.chain, 1e-6 * direction.ravel())
+    assert abs(_lengths(moved)[2] - found.link_length_m[2]) / 1e-6 > 1e-3
+    assert np.isfinite(heading.link_length_sigma_m[1:]).all()
 
 
 def _lengths(chain: Any) -> Array:
