@@ -335,8 +335,8 @@ class Result(Part):
     topology: list[MountingPart] = Field(default_factory=list)
     chain: ChainPart
     rank: int
-    condition: float
-    reduced_chi2: float
+    condition: float | None
+    reduced_chi2: float | None
     unresolved: list[UnresolvedPart]
     null_basis: list[list[float]]
     chain_covariance: list[list[float]]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from coordinator.identification.result import Result
 from coordinator.recording.run_folder import RESULT
 from sim.faults import run, schedule
 from sim.faults.fault import Fault
@@ -70,6 +71,15 @@ def test_a_module_that_was_not_announced_is_forgiven_only_where_modules_are_not_
     assert check_folder(tmp_path / "run", ending) == {}
     found = check_folder(tmp_path / "run", ending._replace(unheard=frozenset()))
     assert f"module {missing} was not found" in found["wrong robot"]
+
+
+def test_the_result_of_a_single_module_can_be_read_again(tmp_path: Path) -> None:
+    """It has nothing to fit, and no condition therefore; the other module is plugged in too late."""
+    one = session(("thesis_171_horizontal", 2), Fault("hot plug", 10.6, math.inf, 0), expects=False)
+    ending = ran(one, tmp_path / "run")
+    assert (ending.name, check_folder(tmp_path / "run", ending)) == ("result", {})
+    read = Result.model_validate_json((tmp_path / "run" / RESULT).read_bytes())
+    assert (read.serials, read.condition, read.reduced_chi2) == ([one.robot.serials[1]], None, None)
 
 
 def test_of_a_joint_that_its_limits_keep_still_only_what_it_carries_is_forgiven(
