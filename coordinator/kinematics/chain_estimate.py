@@ -10,9 +10,11 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import skew
 from module_agent.model.read_only import frozen
 
-# How much an unresolved direction of one metre or radian changes a length that depends on it, at least [m].
-# Named ones change no length at all, and the rest changes others by the errors of the fit.
-HIDDEN_SLOPE = 0.05
+# A length is unknown if what no observation resolves of a module against its parent changes it by more than
+# this share. A free heading about gravity, which is a few degrees off the joint's axis, changes it by less.
+HIDDEN_SHARE = 0.05
+# Where nothing is free of a module against its parent, the null space says so to about 1e-8.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +40,7 @@ class ChainEstimate:
 
     @cached_property
     def _link_lengths(self) -> tuple[Array, Array]:
-        nothing = np.zeros((len(self.covariance), 0))
-        # The named motions, not the null vectors of the fit, which its errors turn and mix: the
-        # heading of a robot whose joint is vertical is that about gravity, a degree or two off the axis.
-        hidden = (item.directions / np.linalg.norm(item.directions, axis=0) for item in self.unresolved)
-        return link_lengths(self.chain, self.covariance, np.concatenate([nothing, *hidden], axis=1))
+        return link_lengths(self.chain, self.covariance, self.null_basis)
 
     @property
     def link_length_m(self) -> Array:
@@ -76,6 +74,9 @@ def link_lengths(chain: Chain, covariance: Array, null_basis: Array | None = Non
         outward = radial[None, :] / length[k] if length[k] > 1e-6 else across
         spread = outward @ slope @ covariance @ slope.T @ outward.T
         sigma[k] = float(np.sqrt(np.trace(spread)))
-        if null_basis is not None and np.linalg.norm(outward @ slope @ null_basis) > HIDDEN_SLOPE:
-            sigma[k] = np.inf
+        if null_basis is not None:
+            free = null_basis[6 * k : 6 * k + 6] - null_basis[6 * parent : 6 * parent + 6]
+            least = max(HIDDEN_SHARE * float(np.linalg.norm(free)), ROUNDING)
+            if np.linalg.norm(outward @ own @ free) > least:
+                sigma[k] = np.inf
     return frozen(length), frozen(sigma)

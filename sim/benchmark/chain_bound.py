@@ -20,13 +20,11 @@ from scipy.linalg import cho_factor, cho_solve, solveh_banded
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE
 from module_agent.model.catalogue import GRAVITY_SIGMA_M_S2, module_type
 from module_agent.model.chain import BASE, Array, Chain
-from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.imu_prior import ImuPrior
-from module_agent.model.perturbation import apply_perturbation, skew
+from module_agent.model.perturbation import skew
 from module_agent.model.read_only import frozen
 from sim.imperfections.module_errors import per_axis
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.scoring.gauge_alignment import REACH_M
 from sim.world.truth import Motion
 
 # Every fourth row of 250 Hz: joints and their springs move below 20 Hz.
@@ -37,7 +35,6 @@ _CHUNK = 1000
 _WIDE = 100.0
 # The same for an IMU's turn [rad] and place [m]: far beyond what counts as unresolved.
 _ANYWHERE = 10.0
-_POSES, _STEP = 100, 1e-5
 
 
 class ChainBound(NamedTuple):
@@ -119,30 +116,6 @@ def _bound(chain: Chain, information: Array, imu_sigmas: Array, gravity: Array) 
     unknown = np.zeros((poses, int(np.count_nonzero(~known))))
     unknown[6:] = vectors[:, ~known]
     return ChainBound(frozen(covariance), frozen(unknown))
-
-
-def tip_bound(chain: Chain, bound: ChainBound, seed: int = 0) -> tuple[float, float]:
-    """Return the least rms errors of the leaves' position [m] and orientation [deg] over random poses.
-
-    The chain counts as moved within its unresolved directions to where the leaves fit best (`align_gauge`).
-    """
-    q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (_POSES, len(chain.serials)))
-    leaves = list(chain.leaves)
-
-    def tips(delta: Array) -> Array:
-        return imu_poses(apply_perturbation(chain, delta), q)[:, leaves, :3].reshape(-1, 3, 4)
-
-    units = _STEP * np.eye(len(bound.covariance))
-    slopes = np.stack([(tips(unit) - tips(-unit)) / (2.0 * _STEP) for unit in units], axis=-1)
-    # The turn's matrix has twice the angle's square.
-    turn = slopes[:, :, :3].reshape(-1, len(units)) / np.sqrt(2.0)
-    both = np.concatenate([slopes[:, :, 3].reshape(-1, len(units)), REACH_M * turn])
-    free = both @ bound.null_basis
-    left = both - free @ np.linalg.lstsq(free, both, rcond=None)[0] if free.size else both
-    squares = np.einsum("ij,jk,ik->i", left, bound.covariance, left)
-    places = 3 * len(slopes)
-    position, angle = squares[:places].sum() / len(slopes), squares[places:].sum() / len(slopes)
-    return float(np.sqrt(position)), float(np.degrees(np.sqrt(angle) / REACH_M))
 
 
 def chain_information(truth: Chain, types: Sequence[str], motion: Motion, profile: NoiseProfile) -> Array:

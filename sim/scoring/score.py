@@ -20,7 +20,15 @@ from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Resul
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.errors import DataError, RobotError
 from module_agent.signals.filtering import resample
-from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
+from sim.scoring.chain_score import (
+    gravity_error_deg,
+    link_errors,
+    link_length_m,
+    link_spread,
+    tip_errors,
+    tip_spread,
+    topology_differences,
+)
 from sim.world.truth import Motion, read_motion, read_truth
 
 # A torque below the sensor's resolution gives no meaningful relative error: an unloaded output needs less.
@@ -36,7 +44,9 @@ class LinkScore(BaseModel):
 
     The length is the perpendicular distance from the parent's joint axis to the child's IMU at q = 0, its
     error is estimate - truth. The vector is that from the axis to the IMU, across the axis; its error and the
-    angle between true and estimated axis are those in the child's IMU frame at q = 0.
+    angle between true and estimated axis are those in the child's IMU frame at q = 0. Sigmas are what the
+    result claims: that of the length is None where it claims nothing, those of vector and axis are in the
+    direction of their errors, and None if it has no covariance.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -48,12 +58,16 @@ class LinkScore(BaseModel):
     link_length_sigma_mm: float | None
     link_vector_error_mm: float | None
     axis_error_deg: float | None
+    link_vector_sigma_mm: float | None = None
+    axis_sigma_deg: float | None = None
 
 
 class Score(BaseModel):
     """The contents of `score.json`; None where nothing could be compared.
 
-    Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame. Torque errors
+    Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame, their sigmas
+    what the result's covariance lets expect of them. The direction of gravity is that in the frame of the
+    first module, if estimate and truth begin at the same one. Torque errors
     are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
     joint whose true torque is below `MIN_TORQUE_NM` (rms); its error in Nm is given nevertheless, as are the
     torques that the errors are relative to.
@@ -66,6 +80,9 @@ class Score(BaseModel):
     links: list[LinkScore]
     tip_position_rms_mm: float | None
     tip_orientation_rms_deg: float | None
+    tip_position_sigma_mm: float | None = None
+    tip_orientation_sigma_deg: float | None = None
+    gravity_error_deg: float | None = None
     unidentifiable: list[str]
     torque_relative_error: float | None = None
     torque_relative_error_per_joint: dict[str, float | None] | None = None
@@ -88,6 +105,7 @@ class _ResultFile(BaseModel):
     chain: ChainPart
     unresolved: list[UnresolvedPart]
     null_basis: list[list[float]]
+    chain_covariance: list[list[float]] = []
     links: list[LinkPart]
     dynamics: dict[str, Any] | None
     robot_time_s: float
@@ -143,12 +161,17 @@ def _compared(
 ) -> Score:
     differences = topology_differences(estimated, truth)
     tip = (None, None) if differences else tip_errors(estimated, truth, null_basis)
+    covariance = np.array(result.chain_covariance) if result.chain_covariance else None
+    spread = None if differences or covariance is None else tip_spread(estimated, covariance, null_basis)
     return Score(
         topology_correct=not differences,
         topology_differences=differences,
-        links=_links(estimated, truth, result.links),
+        links=_links(estimated, truth, result.links, covariance),
         tip_position_rms_mm=tip[0],
         tip_orientation_rms_deg=tip[1],
+        tip_position_sigma_mm=None if spread is None else 1e3 * spread[0],
+        tip_orientation_sigma_deg=None if spread is None else spread[1],
+        gravity_error_deg=gravity_error_deg(estimated, truth),
         unidentifiable=[item.summary for item in result.unresolved],
         robot_time_s=result.robot_time_s,
         wall_time_s=result.wall_time_s,
@@ -156,7 +179,9 @@ def _compared(
     )
 
 
-def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:
+def _links(
+    estimated: Chain, truth: Chain, claimed: list[LinkPart], covariance: Array | None
+) -> list[LinkScore]:
     sigma = {(link.parent, link.child): link.link_length_sigma_mm for link in claimed}
     scores = []
     for child, serial in enumerate(truth.serials):
@@ -164,6 +189,7 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
             continue
         parent = truth.serials[truth.parent[child]]
         error = link_errors(estimated, truth, child)
+        spread = None if covariance is None else link_spread(estimated, truth, child, covariance)
         scores.append(
             LinkScore(
                 parent=parent,
@@ -173,6 +199,8 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
                 link_length_sigma_mm=sigma.get((parent, serial)),
                 link_vector_error_mm=None if error is None else 1e3 * error.vector_m,
                 axis_error_deg=None if error is None else error.axis_deg,
+                link_vector_sigma_mm=None if spread is None else 1e3 * spread.vector_m,
+                axis_sigma_deg=None if spread is None else spread.axis_deg,
             )
         )
     return scores

@@ -24,13 +24,13 @@ from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.network_emulation.profile_file import network as named_network
 from module_agent.signals.clock_map import ClockMap
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
-from sim.benchmark.chain_bound import Bounds, chain_bounds, tip_bound
+from sim.benchmark.chain_bound import Bounds, chain_bounds
 from sim.benchmark.row import Row, count, largest, mean_abs, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import sensing_chain, true_chain
 from sim.robot.variants import as_built, at_random_site
-from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, topology_differences
+from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, tip_spread, topology_differences
 from sim.sensors.module_clock import ModuleClock, module_time
 from sim.thesis.kinematics.circle_chain import thesis_chain
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
@@ -159,8 +159,8 @@ def _scored(
     if bounds is not None:
         bayesian, strict = bounds
         begun = begun._replace(
-            tip_bound=TipErrors(*tip_bound(truth, bayesian)),
-            strict_tip_bound=TipErrors(*tip_bound(truth, strict))
+            tip_bound=TipErrors(*tip_spread(truth, *bayesian)),
+            strict_tip_bound=TipErrors(*tip_spread(truth, *strict))
             if strict.null_basis.shape[1] == bayesian.null_basis.shape[1]
             else None,
         )
@@ -311,9 +311,11 @@ def _over_bound(trials: Sequence[ArmTrial]) -> dict[str, list[float]]:
 
 
 def sigmas_off(trials: Sequence[ArmTrial]) -> list[float]:
-    """Return |error| / sigma of every link's length that was claimed."""
+    """Return |error| / sigma of every link's length; infinite where nothing is claimed of it."""
     links = [link for trial in trials for link in trial.links]
-    return [abs(link.error_m) / link.sigma_m for link in links if link.error_m is not None and link.sigma_m]
+    pairs = [(e, link.sigma_m) for link in links if (e := link.error_m) is not None and link.sigma_m]
+    # Unknown is a miss: a length over infinity would be covered by any claim.
+    return [abs(error_m) / sigma_m if np.isfinite(sigma_m) else np.inf for error_m, sigma_m in pairs]
 
 
 def wrong_row(trials: Sequence[ArmTrial]) -> Row:

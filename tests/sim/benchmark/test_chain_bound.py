@@ -14,17 +14,16 @@ from module_agent.model.imu_prior import CALIBRATED
 from module_agent.model.perturbation import apply_perturbation
 from sim.benchmark.chain_bound import (
     EVERY,
-    ChainBound,
     ChainModel,
     Slopes,
     _without_motion,
     available,
     chain_bounds,
-    tip_bound,
 )
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
+from sim.scoring.chain_score import tip_spread
 from sim.world.truth import Motion
 
 pytestmark = pytest.mark.skipif(not available(), reason="pinocchio is not installed")
@@ -109,7 +108,7 @@ def bounds_of(seconds: float, **changed: float) -> Any:
 def test_more_noise_and_less_motion_make_the_bound_larger() -> None:
     chain = true_chain(load_robot("a2085_03"))
     tips = [
-        tip_bound(chain, found.strict)[0]
+        tip_spread(chain, *found.strict)[0]
         for found in (
             bounds_of(20.0),
             bounds_of(5.0),
@@ -123,7 +122,7 @@ def test_more_noise_and_less_motion_make_the_bound_larger() -> None:
 def test_errors_that_the_profile_has_count_without_priors() -> None:
     chain = true_chain(load_robot("a2085_03"))
     known, scaled = bounds_of(20.0), bounds_of(20.0, accel_scale=0.01, gyro_scale=0.01)
-    assert tip_bound(chain, scaled.strict)[0] > 2.0 * tip_bound(chain, known.strict)[0]
+    assert tip_spread(chain, *scaled.strict)[0] > 2.0 * tip_spread(chain, *known.strict)[0]
     np.testing.assert_allclose(scaled.bayesian.covariance, known.bayesian.covariance)
 
 
@@ -136,8 +135,8 @@ def test_a_leaf_is_no_better_known_than_its_imu_is_placed() -> None:
     placed, catalogued = bounds_of(20.0, **PLACED), bounds_of(20.0)
     # The prior holds whether the profile has the effect or not.
     np.testing.assert_allclose(placed.bayesian.covariance, catalogued.bayesian.covariance)
-    assert tip_bound(chain, placed.bayesian)[0] > np.sqrt(3.0) * CALIBRATED.place_m
-    assert tip_bound(chain, catalogued.strict)[0] < 0.5 * CALIBRATED.place_m
+    assert tip_spread(chain, *placed.bayesian)[0] > np.sqrt(3.0) * CALIBRATED.place_m
+    assert tip_spread(chain, *catalogued.strict)[0] < 0.5 * CALIBRATED.place_m
     # Readings alone do not tell where the housing of a leaf is.
     assert placed.strict.null_basis.shape[1] >= catalogued.bayesian.null_basis.shape[1] + 6
 
@@ -155,7 +154,7 @@ def test_the_estimator_claims_what_the_bound_allows() -> None:
     covariances = fit.noise_covariance, bounds.bayesian.covariance
     lengths = [link_lengths(chain, covariance)[1][1:] for covariance in covariances]
     free = bounds.bayesian.null_basis
-    tips = [tip_bound(chain, ChainBound(covariance, free)) for covariance in covariances]
+    tips = [tip_spread(chain, covariance, free) for covariance in covariances]
     np.testing.assert_allclose(lengths[0], lengths[1], rtol=0.02)
     np.testing.assert_allclose(tips[0], tips[1], rtol=0.02)
 
@@ -183,9 +182,9 @@ def test_the_tips_bound_is_the_shift_that_a_covariance_allows() -> None:
     covariance = np.zeros((12, 12))
     # The second module, which is the tip, may be 2 mm off along x and turned by nothing.
     covariance[9, 9] = 4e-6
-    position_m, orientation_deg = tip_bound(chain, ChainBound(covariance, np.zeros((12, 0))))
+    position_m, orientation_deg = tip_spread(chain, covariance, np.zeros((12, 0)))
     assert position_m == pytest.approx(2e-3, rel=1e-6)
     assert orientation_deg == pytest.approx(0.0, abs=1e-9)
     # A chain that may be moved along x for nothing has no error there.
     free = np.eye(12)[:, 9:10]
-    assert tip_bound(chain, ChainBound(covariance, free))[0] == pytest.approx(0.0, abs=1e-9)
+    assert tip_spread(chain, covariance, free)[0] == pytest.approx(0.0, abs=1e-9)

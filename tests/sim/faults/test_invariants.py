@@ -118,18 +118,22 @@ def test_a_wrong_axis_is_a_wrong_robot_though_every_length_is_right(tmp_path: Pa
     truth["chain"]["axis"][k] = Rotation.from_rotvec(np.radians(4.0) * across).apply(axis).tolist()
     path.write_text(json.dumps(truth))
     found = check_folder(tmp_path / "run", ending)["wrong robot"]
-    assert f"link {first} - {second} has its axis" in found
+    assert f"link {first} - {second} the axis is" in found
 
 
-def test_a_wrong_zero_of_an_encoder_is_a_wrong_robot_though_every_link_is_right(tmp_path: Path) -> None:
-    one = session(ARM)
+@pytest.mark.parametrize("robot", [ARM, ("thesis_171_vertical", 2), ("tree_y", 3)], ids=lambda one: one[0])
+def test_a_wrong_zero_of_an_encoder_is_a_wrong_robot_though_every_link_is_right(
+    robot: tuple[str, int], tmp_path: Path
+) -> None:
+    """By ten degrees: a short session knows the vertical arm's zero to one and a half."""
+    one = session(robot)
     ending = ran(one, tmp_path / "run")
     path = tmp_path / "run" / "truth.json"
     truth = json.loads(path.read_text())
-    chain, (_, second, last) = truth["chain"], one.robot.serials
+    chain, (second, last) = truth["chain"], one.robot.serials[-2:]
     k, leaf = (chain["serials"].index(serial) for serial in (second, last))
     axis, point = np.array(chain["axis"][k]), np.array(chain["point"][k])
-    turn = Rotation.from_rotvec(np.radians(6.0) * axis)
+    turn = Rotation.from_rotvec(np.radians(10.0) * axis)
     home = np.array(chain["imu_home"][leaf])
     home[:3, 3] = point + turn.apply(home[:3, 3] - point)
     home[:3, :3] = turn.as_matrix() @ home[:3, :3]
@@ -137,7 +141,35 @@ def test_a_wrong_zero_of_an_encoder_is_a_wrong_robot_though_every_link_is_right(
     chain["axis"][leaf] = turn.apply(chain["axis"][leaf]).tolist()
     chain["point"][leaf] = (point + turn.apply(np.array(chain["point"][leaf]) - point)).tolist()
     path.write_text(json.dumps(truth))
-    assert "the tips are turned by" in check_folder(tmp_path / "run", ending)["wrong robot"]
+    assert "the tips are" in check_folder(tmp_path / "run", ending)["wrong robot"]
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "kind", "words"),
+    [
+        ("links", "unknown", "wrong robot", "has a length of which nothing is claimed, with exit code 0"),
+        ("chain", "turned", "wrong robot", "degrees off, expected at most 3.00"),
+        ("rank", "many", "unreadable result", "rank"),
+        ("chain", "missing", "unreadable result", "chain"),
+    ],
+)
+def test_a_result_that_claims_nothing_or_cannot_be_read_is_a_violation(
+    part: str, value: str, kind: str, words: str, tmp_path: Path
+) -> None:
+    one = session(("thesis_171_horizontal", 2))
+    ending = ran(one, tmp_path / "run")
+    document = result(tmp_path / "run")
+    if value == "unknown":
+        document["links"][0]["link_length_sigma_mm"] = None
+    elif value == "turned":
+        x, y, z = document["chain"]["gravity"]
+        document["chain"]["gravity"] = np.cross([x, y, z], [y, z, x]).tolist()
+    elif value == "missing":
+        del document[part]
+    else:
+        document[part] = value
+    (tmp_path / "run" / RESULT).write_text(json.dumps(document))
+    assert words in check_folder(tmp_path / "run", ending)[kind]
 
 
 def _displace(path: Path, serial: str) -> None:

@@ -128,6 +128,23 @@ def test_the_truth_scores_zero(tmp_path: Path) -> None:
     assert (found.robot_time_s, found.wall_time_s) == (61.5, None)
 
 
+def test_what_a_result_claims_stands_beside_its_errors(tmp_path: Path) -> None:
+    leaf = SERIALS.index("right-2")
+    covariance = np.zeros((6 * len(SERIALS),) * 2)
+    covariance[6 * leaf + 3 :, 6 * leaf + 3 :][:3, :3] = 4e-6 * np.eye(3)
+    found = score(make_run(tmp_path, TRUTH, chain_covariance=covariance.tolist()))
+    claimed = {link.child: link.link_vector_sigma_mm for link in found.links}
+    assert claimed.pop("right-2") == pytest.approx(2.0)
+    assert list(claimed.values()) == pytest.approx([0.0] * 4, abs=1e-9)
+    # Of two leaves one is off by 2 mm in each of three directions.
+    assert found.tip_position_sigma_mm == pytest.approx(2.0 * np.sqrt(3.0 / 2.0))
+    assert found.tip_orientation_sigma_deg == pytest.approx(0.0, abs=1e-9)
+    without = score(make_run(tmp_path, TRUTH))
+    assert without.links[0].link_vector_sigma_mm is None
+    assert without.tip_position_sigma_mm is None
+    assert without.gravity_error_deg == pytest.approx(0.0, abs=1e-9)
+
+
 def test_another_order_of_modules_scores_the_same(tmp_path: Path) -> None:
     found = score(make_run(tmp_path, reorder(TRUTH, OTHER_ORDER), predicted=1.1))
     assert found.topology_correct
