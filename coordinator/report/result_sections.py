@@ -114,7 +114,9 @@ def _links(result: Result) -> Section:
         for value, sigma in zip(one.values, one.sigma, strict=True):
             rows[-1] += [value, _half_95(sigma)]
     poses = Table.of("Pose of the child's mounting face in the parent's moved face", columns, rows)
-    dash = Paragraph(text="A dash instead of an interval: part of this figure cannot be known, see below.")
+    dash = Paragraph(
+        text="A dash instead of an interval: no motion tells this figure, or a part of it; see below."
+    )
     if not result.links:
         return Section(title="Links", blocks=(Paragraph(text="A single module has no links."),))
     return Section(title="Links", blocks=(lengths, poses, dash))

@@ -148,6 +148,11 @@ def _summary(run: RunData) -> Section:
     spread = [HALF_95 * sigma for sigma in sigmas if sigma is not None]
     if spread:
         items.append(f"{_links_known(len(spread))} within ± {_from_to(min(spread), max(spread))} mm (95 %).")
+    items += [
+        f"The length of the link {link.parent} - {link.child} is not known."
+        for link in result.links
+        if link.link_length_sigma_mm is None
+    ]
     if result.dynamics is None:
         withheld = bool(result.suspicions) and run.recording.motions("dynamic")
         items.append(

@@ -206,7 +206,7 @@ class ViewerFeed:
         if self._overlay is not None:
             self._overlay.chain(self._viewer, now_ns, chain, fit.unresolved)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
-        sigma = [s if np.isfinite(s) else 0.0 for s in fit.link_length_sigma_m.tolist()]
+        sigma = [0.0 if np.isnan(s) else s for s in fit.link_length_sigma_m.tolist()]
         self._viewer.chain(now_ns, chain, sigma, fit.covariance)
         self._drawn = True
 

@@ -11,9 +11,9 @@ run = simulate(
 chain = run.identified.kinematics.fit.chain
 for link in run.identified.result.links:
     error = link_errors(chain, run.truth.chain, run.truth.chain.serials.index(link.child))
-    # None if no motion told it.
-    sigma_mm = link.link_length_sigma_mm or float("inf")
-    claimed = f"{link.link_length_mm:.2f} +- {sigma_mm:.2f} mm"
+    sigma_mm = link.link_length_sigma_mm
+    # Without a sigma the length is not known.
+    claimed = "not known" if sigma_mm is None else f"{link.link_length_mm:.2f} +- {sigma_mm:.2f} mm"
     print(
         f"{link.parent} - {link.child}: {claimed}, off by {1e3 * error.length_m:+.2f} mm"
         if error

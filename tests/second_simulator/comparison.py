@@ -50,7 +50,9 @@ def link_errors(result: Result, robot: Robot) -> list[LinkError]:
     errors = []
     for link, transform in zip(result.links, result.transforms, strict=True):
         child = robot.serials.index(link.child)
-        length = (link.link_length_mm - 1e3 * robot.link_length_m(child)) / link.link_length_sigma_mm
+        # A length of which nothing is claimed counts as wrong.
+        sigma_mm = link.link_length_sigma_mm or 0.0
+        length = float(np.divide(link.link_length_mm - 1e3 * robot.link_length_m(child), sigma_mm))
         errors.append(LinkError(link.child, length, *_transform_errors(transform, *robot.link(child))))
     return errors
 

@@ -63,6 +63,15 @@ def test_the_run_wrote_the_report_that_its_folder_gives(folder: Path, document: 
     assert (folder / REPORT).read_text() == html_page(document)
 
 
+def test_a_link_of_unknown_length_is_said_and_has_no_interval(folder: Path, result: Result) -> None:
+    (link,) = result.links
+    unknown = result.model_copy(update={"links": [link.model_copy(update={"link_length_sigma_mm": None})]})
+    shown = run_report(read_run(folder)._replace(result=unknown))
+    assert f"The length of the link {link.parent} - {link.child} is not known." in html_page(shown)
+    assert "The length of the only link is known" not in html_page(shown)
+    assert column(tables(shown.section("Links"))[0], "± 95 %") == [None]
+
+
 def test_every_module_has_its_row_in_every_table(document: Document, result: Result) -> None:
     for title, name in (("Topology", "module"), ("Axes", "joint"), ("IMUs", "module"), ("Torques", "joint")):
         (table,) = tables(document.section(title))

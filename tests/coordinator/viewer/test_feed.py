@@ -81,6 +81,21 @@ def _fit(chain: Chain) -> ChainEstimate:
     return ChainEstimate(chain, nothing, nothing[:, :0], 0, 1.0)
 
 
+def test_a_link_of_unknown_length_is_shown_as_unknown_and_the_root_as_exact(rig: Rig) -> None:
+    rig.connect("A", "B")
+    home = np.tile(np.eye(4), (2, 1, 1))
+    home[1, :3, 3] = [0.2, 0.0, 0.05]
+    axes = np.tile([0.0, 0.0, 1.0], (2, 1))
+    arm = Chain(("A", "B"), (-1, 0), (False, False), axes, home[:, :3, 3], home, np.array([0.0, -9.8, 0.0]))
+    outward = np.zeros((12, 1))
+    outward[9] = 1.0
+    fit = ChainEstimate(arm, np.zeros((12, 12)), outward, 0, 1.0)
+    shown: list[list[float]] = []
+    rig.viewer.chain = lambda now_ns, chain, sigma_m, covariance: shown.append(sigma_m)
+    rig.feed.chain(0, fit)
+    assert shown == [[0.0, np.inf]]
+
+
 def _rows(*numbers: int) -> list[tuple[int, float]]:
     return [(4 * MS * number, float(number)) for number in numbers]
 

@@ -21,6 +21,7 @@ from sim.benchmark.cases.arm import (
     TipErrors,
     arm_cases,
     arm_plan,
+    sigmas_off,
 )
 from sim.benchmark.cases.joint import SETTINGS, joint_cases
 from sim.benchmark.cases.link_change import DAYS, Checks, LinkChangeTrial, link_change_cases
@@ -280,6 +281,12 @@ def test_small_robots_are_the_smallest_of_ten() -> None:
     (trial,) = topology_cases(1, 0, small=True)[0].trials
     sizes = [len(random_robot(seed).modules) for seed in range(10)]
     assert sizes[trial.arguments[0]] == min(sizes)
+
+
+def test_a_length_of_which_nothing_is_claimed_is_covered_by_no_claim() -> None:
+    trial = network("lan", 0, 1.0)
+    unknown = trial.links[0]._replace(sigma_m=np.inf)
+    assert sigmas_off([trial._replace(links=(unknown, trial.links[1]))]) == [np.inf, pytest.approx(1.0)]
 
 
 def network(name: str, seed: int, error_mm: float, **changed: Any) -> ArmTrial:
