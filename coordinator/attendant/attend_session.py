@@ -104,11 +104,13 @@ class AttendSession:
         """
         known = await self._site.compute(lambda: load_baseline(self._versions.folder))
         reference = await self._site.compute(lambda: build_reference(known))
-        if self._measurer is not None and (why := known.kinematics.suspicions):
-            raise UnsuitableBaseline(
-                f"{known.folder} is not to be believed as usual, so that no measurement could be: "
-                f"{'; '.join(why)}. Identify the robot anew, or attend it without --may-move"
-            )
+        if why := "; ".join(known.kinematics.suspicions):
+            if self._measurer is not None:
+                raise UnsuitableBaseline(
+                    f"{known.folder} is not to be believed as usual, so that no measurement could be: "
+                    f"{why}. Identify the robot anew, or attend it without --may-move"
+                )
+            self._say(f"{known.folder} is not to be believed as usual: {why}")
         serials = reference.chain.serials
         attendant = Attendant(serials, self._measurer is not None, self._patience)
         self._say(f"attends {known.name}, version {self._versions.current_number}: {', '.join(serials)}")

@@ -8,7 +8,7 @@ import typer
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed, TakeSuspect
 from coordinator.commands.views.compensation import CompensationView
 from coordinator.live_robot.connection import new_sender, open_connection
-from coordinator.runtime.command_line import fail, with_options
+from coordinator.runtime.command_line import end_if_suspect, fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal
 from coordinator.torque_control.gains import max_damping_nm_s_rad
@@ -50,7 +50,7 @@ def compensate_robot(
     At the end or on Ctrl-C the robot holds its position, returns to where it started, and is released. Ctrl-C
     on the way back stops it there; a second one stops it at once. After a limit was exceeded it does not
     return, but is released where it is. Exit codes: 0 also after Ctrl-C; 1 the start was refused, or a limit
-    was exceeded; others as of `run`.
+    was exceeded; 5 the model is that of a suspect run; others as of `run`.
     """
     model = gravity_model(baseline, suspect)
     place = at.place(model.robot)
@@ -82,6 +82,7 @@ def compensate_robot(
     view.summary(summary)
     if summary.is_fault:
         fail(summary.why, EXIT_FAILED)
+    end_if_suspect(model.suspicions)
 
 
 def _check(option: str, value: float | None, least: float, most: float, unit: str) -> None:

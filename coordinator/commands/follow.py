@@ -8,7 +8,7 @@ import typer
 
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, JsonFile, Speed, TakeSuspect
 from coordinator.live_robot.connection import new_sender, open_connection
-from coordinator.runtime.command_line import in_a_folder, with_options
+from coordinator.runtime.command_line import end_if_suspect, in_a_folder, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal, new_table, print_table, write_result
 from coordinator.torque_control.follow_session import FollowPlan, FollowSession
@@ -55,7 +55,8 @@ def follow(
 
     The robot moves slowly to the start of the motion before each mode, and back at the end. Position, speed
     and calculated torque of the whole motion are checked first. Ctrl-C stops all modules. Exit codes: 0 done,
-    1 the robot refused the motion, or lost track of it; others as of `run`.
+    1 the robot refused the motion, or lost track of it; 5 the model is that of a suspect run; others as of
+    `run`.
     """
     model = gravity_model(baseline, suspect)
     place = at.place(model.robot)
@@ -81,10 +82,10 @@ def follow(
         result = attend(loop, session.run())
     file = result_path(baseline, out)
     write_json(file, result)
-    if not write_result(json_file, result):
-        return
-    _print(result)
-    typer.echo(f"{file}: tracking of {result.motion}, {result.duration_s:.1f} s, in SI units")
+    if write_result(json_file, result):
+        _print(result)
+        typer.echo(f"{file}: tracking of {result.motion}, {result.duration_s:.1f} s, in SI units")
+    end_if_suspect(result.suspicions)
 
 
 def _modes(chosen: list[int] | None) -> tuple[InputMode, ...]:

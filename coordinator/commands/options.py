@@ -25,7 +25,7 @@ DynamicsFolder = Annotated[
     Path, typer.Argument(help="Folder of an earlier run of this robot with dynamics, its baseline.")
 ]
 TakeSuspect = Annotated[
-    bool, typer.Option("--suspect", help="Move by a model too whose run ended with code 5.")
+    bool, typer.Option("--suspect", help="Use the model even if its run ended with code 5.")
 ]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
 Expect = Annotated[

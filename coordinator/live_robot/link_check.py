@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,36 +16,19 @@ MAX_MEASUREMENTS = 3
 BETWEEN_S = 0.03
 
 
-class _Counted(NamedTuple):
-    """The last row of the latest boot of a module."""
-
-    boot: int
-    end_row: int
-
-    @classmethod
-    def of(cls, group: ModuleGroup, serial: str) -> "_Counted":
-        record = group.module(serial)
-        return cls(record.boot, record.rows.end_row)
-
-    def rows_since(self, before: "_Counted") -> int:
-        """Return how many rows have come; a boot counts its rows from zero."""
-        return self.end_row - before.end_row if self.boot == before.boot else self.end_row
-
-
 async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
     """Measure rates and round trips of all modules and note them.
 
     Raises:
         UnfitLink: after `MAX_MEASUREMENTS`, feedback is lost, or commands would be too old on arrival.
     """
-    before = {serial: _Counted.of(group, serial) for serial in group.serials}
+    before = {serial: group.module(serial).rows.end_row for serial in group.serials}
     start_ns = clock()
     for number in range(1, MAX_MEASUREMENTS + 1):
         end_ns = start_ns + number * int(seconds * 1e9)
         await gather_all(_ask_until(group, serial, clock, end_ns) for serial in group.serials)
         span_s = (clock() - start_ns) / 1e9
-        now = {serial: _Counted.of(group, serial) for serial in group.serials}
-        rates = {s: now[s].rows_since(before[s]) / span_s for s in group.serials}
+        rates = {s: (group.module(s).rows.end_row - before[s]) / span_s for s in group.serials}
         faults = [fault for s in group.serials if (fault := _fault(group, s, rates[s]))]
         if not faults:
             break

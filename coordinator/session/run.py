@@ -362,8 +362,11 @@ class Run:
             self._screen.note(line)
 
     async def excitation(self) -> tuple[RobotMotion, ...]:
-        """Design excitation motions of all joints at once for the identified chain."""
+        """Design excitation motions of all joints at once for the identified chain; none if it is suspect."""
         assert self._chain is not None, "all joints are explored before any is excited"
+        if self._explored is not None and self._explored.suspicions:
+            self._screen.note("exciting joint by joint: what was explored is not to be believed as usual")
+            return ()
         chain, plan, gate = self._chain, self._config.plan, self._config.gate
         allowed = None if gate is None else gate.allows
         modules = [RobotModule(self._group.kind(s), self._group.info(s).limits) for s in chain.serials]

@@ -156,6 +156,7 @@ class FollowSession:
             drive=self._plan.drive,
             missed=self._missed,
             modes=tuple(measured),
+            suspicions=self._model.suspicions,
         )
 
     # ------------------------------------------------------------------ one mode

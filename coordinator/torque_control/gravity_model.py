@@ -19,12 +19,16 @@ from module_agent.model.regressor import inverse_dynamics
 
 
 class GravityModel(NamedTuple):
-    """A robot of n joints: its name, its modules' types in the chain's order, its parameters (10 n,)."""
+    """A robot of n joints: its name, its modules' types in the chain's order, its parameters (10 n,).
+
+    suspicions: why it is not to be believed as usual.
+    """
 
     robot: str
     types: tuple[str, ...]
     chain: Chain
     phi: Array
+    suspicions: tuple[str, ...] = ()
 
     def effort_nm(self, q_rad: ArrayLike, qd_rad_s: ArrayLike) -> Array:
         """Return the spring torques (n,) [Nm] at positions and velocities (n,) without acceleration.
@@ -64,15 +68,16 @@ def gravity_model(folder: Path, suspect: bool = False) -> GravityModel:
         BaselineError: the folder holds no result, one without dynamics, or one that is suspect.
     """
     result = read_result(folder)
+    why = "; ".join(result.suspicions)
     if result.dynamics is None:
         raise BaselineError(
-            f"{folder / RESULT} has no inertial parameters: the run had --no-dynamics, or ended with code 5; "
+            f"the result in {folder} has no inertial parameters: {why or 'the run had --no-dynamics'}; "
             "identify the robot again"
         )
-    if result.suspicions and not suspect:
+    if why and not suspect:
         raise BaselineError(
-            f"{folder / RESULT} is not to be believed as usual: {'; '.join(result.suspicions)}. Identify the "
-            "robot again, or move it by this model nevertheless, with --suspect"
+            f"the result in {folder} is not to be believed as usual: {why}. Identify the robot again, or "
+            "move it by this model nevertheless, with --suspect"
         )
     return gravity_model_of_result(result)
 
@@ -93,7 +98,7 @@ def gravity_model_of_result(result: Result) -> GravityModel:
         pairs = zip(chain.serials, link_homes(chain), strict=True)
         phi = np.concatenate([parameter_transform(home) @ _about_origin(by_serial[s]) for s, home in pairs])
     types = tuple(result.types[s] for s in chain.serials)
-    return GravityModel(result.robot, types, chain, read_only(phi))
+    return GravityModel(result.robot, types, chain, read_only(phi), tuple(result.suspicions))
 
 
 def _about_origin(one: ModuleBodyPart) -> Array:

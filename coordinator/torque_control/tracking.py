@@ -53,7 +53,7 @@ class FollowResult(Part):
     """What `x5-coordinator follow` measured, `follow.json`.
 
     drive: whether the torques of mode 3 had the motors' losses added. missed: set-points that were due and
-    not sent.
+    not sent. suspicions: why the model that the torques are of is not to be believed as usual.
     """
 
     schema_number: int = SCHEMA
@@ -64,6 +64,7 @@ class FollowResult(Part):
     drive: bool
     missed: int
     modes: tuple[ModeTracking, ...]
+    suspicions: tuple[str, ...] = ()
 
 
 def calculated_nm(

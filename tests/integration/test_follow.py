@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from module_agent.model.errors import EXIT_SUSPECT
+
 ROBOT = "thesis_171_horizontal"
 
 
@@ -23,10 +25,10 @@ def follow(launcher, known_folder, tmp_path):
     path.write_text("\n".join([f"t_s,q_{moving}_rad", *(f"{k / 8},{q}" for k, q in enumerate(swing))]) + "\n")
     started = []
 
-    def start(*options: str) -> "subprocess.Popen[str]":
+    def start(*options: str, **known: object) -> "subprocess.Popen[str]":
         process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "coordinator.main", "follow", str(known_folder(ROBOT))),
+                *(sys.executable, "-m", "coordinator.main", "follow", str(known_folder(ROBOT, **known))),
                 *("--motion", str(path), "--listen", robot.config.endpoint, "--network", "lan", *options),
             ],
             stdin=subprocess.DEVNULL,
@@ -46,11 +48,14 @@ def follow(launcher, known_folder, tmp_path):
 
 def test_it_follows_in_all_modes_and_writes_what_it_measured(follow, tmp_path: Path, programs) -> None:
     out = tmp_path / "follow.json"
-    process = follow("--out", str(out))
+    # The model is that of a suspect run, which all that comes of it tells.
+    process = follow("--out", str(out), "--suspect", suspicions=["its IMU is sick"])
     text, notes = process.communicate(timeout=programs.limit_s)
-    assert process.returncode == 0, notes
+    assert process.returncode == EXIT_SUSPECT, notes
+    assert "not to be believed as usual: its IMU is sick" in notes
     assert "Tracking error by input mode" in text
     result = json.loads(out.read_text())
+    assert result["suspicions"] == ["its IMU is sick"]
     assert [one["mode"] for one in result["modes"]] == [1, 2, 3]
     for one in result["modes"]:
         # The motion is 0.09 rad long: a joint that stood still would be off by that.

@@ -98,6 +98,7 @@ def test_a_model_that_is_not_to_be_believed_is_no_reason_to_move_the_robot(
     scene = Scene(known_arm, tmp_path / "attended")
     scene.plays(5.0)
     assert scene.ears.heard(f"attends {ARM.name}")
+    assert scene.ears.heard(f"not to be believed as usual: {why}")
 
 
 def test_a_second_measurement_is_granted_the_modules_as_the_first_was(

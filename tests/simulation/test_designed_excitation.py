@@ -1,5 +1,7 @@
 """A whole session whose inertia is told by motions of all joints at once, designed from its own chain."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -7,9 +9,10 @@ from scipy.linalg import block_diag
 from coordinator.dynamics.pseudo_inertia import parameter_transform
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified, Kinematics
-from coordinator.identification.identify import identify
+from coordinator.identification.identify import identify, identify_kinematics
 from coordinator.parameter_fit.base_parameters import joint_frames
 from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import SESSION, load_recording
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
 from module_agent.model.chain import Chain
 from module_agent.model.regressor import torque_regressor
@@ -21,6 +24,7 @@ from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import build_tree, true_chain, true_inertia
 from sim.robot.variants import as_built
 from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from sim.virtual_time.session import record_session
 
 # Tests of this group share recorded runs: they stay in one process.
@@ -48,6 +52,22 @@ def recording(found_in: tuple[Recording, Identified]) -> Recording:
 @pytest.fixture(scope="module")
 def found(found_in: tuple[Recording, Identified]) -> Identified:
     return found_in[1]
+
+
+def test_no_motion_of_all_joints_is_designed_on_an_exploration_that_is_suspect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it would be free of collisions is told by a chain that is not believed."""
+    monkeypatch.setattr(
+        "coordinator.session.run.identify_kinematics",
+        lambda *of: identify_kinematics(*of)._replace(damage=("an IMU is sick",)),
+    )
+    plan = QUICK_PLAN.model_copy(update={"dynamics": True, "excitation": "d-optimal", "dynamic_repeats": 1})
+    robot = load_robot("thesis_171_horizontal")
+    run_virtual(VirtualConfig(robot, tmp_path / "run", seed=3, plan=plan))
+    journal = load_recording(tmp_path / "run" / SESSION).journal
+    excited = [event for event in journal if event.what == "motion" and event.purpose == "dynamic"]
+    assert {event.step for event in excited} == {f"excite/{serial}" for serial in robot.serials}
 
 
 def base_parameter_count(chain: Chain) -> int:

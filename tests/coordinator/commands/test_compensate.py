@@ -65,10 +65,17 @@ def test_a_folder_that_does_not_tell_the_weight_for_certain_is_wrong_usage(
         (tmp_path / "nowhere", "holds no result.json: give the folder of a run that has finished"),
         (known_folder("a2085_03", dynamics=None), "the run had --no-dynamics"),
         (known_folder("tree_y", suspicions=["its IMU is sick"]), "its IMU is sick. Identify the robot again"),
+        (
+            known_folder("thesis_171_horizontal", dynamics=None, suspicions=["a module is missing"]),
+            "has no inertial parameters: a module is missing; identify the robot again",
+        ),
     ):
         done = CliRunner().invoke(app, ["compensate", str(folder)])
         assert done.exit_code == 2, done.output
         assert words in done.output
+    # The model is taken now, and what is wrong next is the rate.
+    suspect = ["compensate", str(tmp_path / "known-tree_y"), "--suspect", "--rate", "5"]
+    assert "--rate 5.0: it must be" in CliRunner().invoke(app, suspect).output
 
 
 # --------------------------------------------------------------------------- what is to be seen

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from coordinator.live_robot.errors import UnfitLink
-from coordinator.live_robot.link_check import MAX_MEASUREMENTS, _Counted, check_link
+from coordinator.live_robot.link_check import MAX_MEASUREMENTS, check_link
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 
 ARM = "thesis_171_horizontal"
@@ -78,12 +78,6 @@ def test_a_second_module_with_the_same_serial_is_named_though_it_answers_nothing
 
     with pytest.raises(UnfitLink, match=rf"unfit: module {TIP} booted anew .* or a second module has its"):
         rig.run(work())
-
-
-def test_rows_of_a_boot_are_counted_from_zero() -> None:
-    """A module that booted anew during the check does not deliver fewer rows than none."""
-    before, same, other = _Counted(boot=7, end_row=100), _Counted(7, 130), _Counted(8, 30)
-    assert (same.rows_since(before), other.rows_since(before)) == (30, 30)
 
 
 def test_a_short_outage_is_measured_again(rigs: Callable[..., Any]) -> None:
