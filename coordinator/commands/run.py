@@ -190,8 +190,9 @@ def print_result(result: Result, terminal: Terminal) -> None:
     """Print the links, what is not identifiable, and how well the inertial parameters predict."""
     table = new_table(f"{result.robot}: links", "parent | child | link length [mm] | +-")
     for link in result.links:
-        sigma = figure(link.link_length_sigma_mm, ".1f")
-        table.add_row(link.parent, link.child, f"{link.link_length_mm:.1f}", sigma)
+        sigma = link.link_length_sigma_mm
+        length = None if sigma is None else link.link_length_mm
+        table.add_row(link.parent, link.child, figure(length, ".1f"), figure(sigma, ".1f"))
     terminal.console.print(table)
     for item in result.unresolved:
         terminal.note(f"not identifiable: {item.summary}")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.identification.result import DynamicsPart, MountingPart, Result
+from coordinator.identification.result import DynamicsPart, LinkPart, MountingPart, Result
 from coordinator.report.document import Block, Cell, Column, Figure, Paragraph, Section, Table
 from coordinator.report.plots import torque_plot
 from module_agent.model.chain import Array
@@ -94,10 +94,7 @@ def _links(result: Result) -> Section:
             Column(name="length", unit="mm", form=".2f"),
             Column(name="± 95 %", unit="mm", form=".2f"),
         ),
-        [
-            (link.parent, link.child, link.link_length_mm, _half_95(link.link_length_sigma_mm))
-            for link in result.links
-        ],
+        [(link.parent, link.child, *_length(link)) for link in result.links],
     )
     names = result.transforms[0].parameters if result.transforms else []
     columns = [Column(name="from"), Column(name="to")]
@@ -114,12 +111,16 @@ def _links(result: Result) -> Section:
         for value, sigma in zip(one.values, one.sigma, strict=True):
             rows[-1] += [value, _half_95(sigma)]
     poses = Table.of("Pose of the child's mounting face in the parent's moved face", columns, rows)
-    dash = Paragraph(
-        text="A dash instead of an interval: no motion tells this figure, or a part of it; see below."
-    )
+    dash = Paragraph(text="A dash: no motion tells this figure, or a part of it, see below.")
     if not result.links:
         return Section(title="Links", blocks=(Paragraph(text="A single module has no links."),))
     return Section(title="Links", blocks=(lengths, poses, dash))
+
+
+def _length(link: LinkPart) -> tuple[float | None, float | None]:
+    """Return a length and its interval; what stands for an unknown one is where the fit began."""
+    sigma = link.link_length_sigma_mm
+    return None if sigma is None else link.link_length_mm, _half_95(sigma)
 
 
 def _half_95(sigma: float | None) -> float | None:

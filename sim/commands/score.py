@@ -45,8 +45,18 @@ def table(result: Score) -> Table:
             figure(link.axis_error_deg, ".3f", " deg"),
         )
     shown.add_section()
-    shown.add_row("tip position, rms", "", figure(result.tip_position_rms_mm, ".2f", " mm"), "", "")
-    shown.add_row("tip orientation, rms", "", figure(result.tip_orientation_rms_deg, ".3f", " deg"), "", "")
+    for name, error, sigma, form, unit in (
+        ("tip position, rms", result.tip_position_rms_mm, result.tip_position_sigma_mm, ".2f", " mm"),
+        (
+            "tip orientation, rms",
+            result.tip_orientation_rms_deg,
+            result.tip_orientation_sigma_deg,
+            ".3f",
+            " deg",
+        ),
+        ("direction of gravity", result.gravity_error_deg, None, ".3f", " deg"),
+    ):
+        shown.add_row(name, "", figure(error, form, unit), figure(sigma, form, unit), "")
     _add_torques(shown, result)
     shown.add_section()
     shown.add_row("robot time", figure(result.robot_time_s, ".1f", " s"), "", "", "")
