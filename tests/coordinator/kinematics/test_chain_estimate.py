@@ -69,5 +69,17 @@ def test_a_length_stays_unknown_however_many_modules_share_the_direction(robots:
     assert np.array_equal(np.isinf(sigma_m[1:]), [True, False, False])
 
 
+def test_the_error_of_a_null_space_leaves_a_length_known(robots: Any) -> None:
+    """With precise priors, what moves two modules as one body moves them apart by some 3e-4 of it."""
+    chain, _ = robots.random(0, joints=4, serial=True)
+    axis, off = chain.axis[0], chain.imu_home[1, :3, 3] - chain.point[0]
+    outward = off - axis * (axis @ off)
+    twists = np.tile(np.concatenate([axis, np.cross(chain.point[0], axis)]), (4, 1))
+    twists /= np.linalg.norm(twists)
+    twists[1:, 3:] += 3e-4 * outward / np.linalg.norm(outward)
+    sigma_m = link_lengths(chain, np.zeros((24, 24)), twists.reshape(-1, 1))[1]
+    assert np.isfinite(sigma_m[1:]).all()
+
+
 def _lengths(chain: Any) -> Array:
     return link_lengths(chain, np.zeros((24, 24)))[0]
