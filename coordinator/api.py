@@ -80,18 +80,27 @@ class SavedRun:
         self.covariance: Array = np.asarray(result.chain_covariance, dtype=float)
 
     def __repr__(self) -> str:
-        """Name folder, robot and modules."""
-        return f"SavedRun({str(self.folder)!r}: {self.result.robot}, modules {', '.join(self.serials)})"
+        """Name folder, robot and modules, and say if the result is suspect."""
+        suspect = ", suspect" if self.suspicions else ""
+        return (
+            f"SavedRun({str(self.folder)!r}: {self.result.robot}, modules {', '.join(self.serials)}{suspect})"
+        )
 
     @property
     def serials(self) -> tuple[str, ...]:
         """Serials of the modules in the order of the chain's joints."""
         return self.chain.serials
 
+    @property
+    def suspicions(self) -> tuple[str, ...]:
+        """Why the result is not to be believed as usual, the reasons of exit code 5; mostly empty."""
+        return tuple(self.result.suspicions)
+
     @cached_property
     def phi(self) -> Array | None:
         """The (10 n,) inertial parameters of physically consistent bodies, None for a run without dynamics.
 
+        Those of a suspect result are given as they are: see `suspicions`.
         Per body [m, m c (3), I about the root frame's origin (xx, xy, xz, yy, yz, zz)], root frame at q = 0.
         """
         return None if self.result.dynamics is None else gravity_model_of_result(self.result).phi

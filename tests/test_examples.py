@@ -1,6 +1,7 @@
 """The example scripts do what they say, in a process of their own and in another folder."""
 
 import csv
+import json
 import os
 import re
 import subprocess
@@ -40,11 +41,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def run(tmp_path: Path, script: str, *arguments: str) -> str:
+def run(tmp_path: Path, script: str, *arguments: str, warned: str = "") -> str:
     environment = {**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(EXAMPLES / script), *arguments]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
+    assert warned in done.stderr
     return done.stdout
 
 
@@ -87,6 +89,15 @@ def test_a_run_is_a_data_frame_in_one_line(folder: Path) -> None:
 
 def test_gravity_torques_are_printed_over_a_turn_of_a_joint(tmp_path: Path, folder: Path) -> None:
     assert len(run(tmp_path, "gravity_torques.py", str(folder), "X-00010").splitlines()) == 10
+
+
+def test_torques_of_a_suspect_run_come_with_the_reason(tmp_path: Path, folder: Path) -> None:
+    document = json.loads((folder / "result.json").read_text()) | {"suspicions": ["a clock jumped"]}
+    (tmp_path / "result.json").write_text(json.dumps(document))
+    why = "not to be believed as usual: a clock jumped"
+    assert len(run(tmp_path, "gravity_torques.py", str(tmp_path), "X-00010", warned=why).splitlines()) == 10
+    assert repr(load_run(tmp_path)).endswith(", suspect)")
+    assert load_run(folder).suspicions == ()
 
 
 def test_a_simulated_robot_is_identified_and_compared_with_the_truth(tmp_path: Path) -> None:

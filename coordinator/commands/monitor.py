@@ -23,7 +23,7 @@ from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import read_session
-from coordinator.runtime.command_line import with_options
+from coordinator.runtime.command_line import end_if_suspect, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.key_presses import key_presses
 from coordinator.runtime.terminal import Terminal
@@ -62,7 +62,7 @@ def monitor_robot(
     Of a known robot collisions, payloads, friction and wear are reported, on a terminal below the table.
     Nothing is commanded and no lease is taken, but by the keys of the table: s stops all modules, h holds
     them where they are, l lights the next one's LED, q ends.
-    Exit codes: 0 no findings, 4 findings, others as of `run`.
+    Exit codes: 0 no findings, 4 findings, 5 no findings but a suspect baseline, others as of `run`.
     """
     if baseline is None:
         _show_modules(at, recording, for_s, json_file, speed)
@@ -71,7 +71,8 @@ def monitor_robot(
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     known = load_baseline(baseline)
     reference = build_reference(known)
-    doubts = [f"{baseline} is not to be believed as usual: {why}" for why in known.kinematics.suspicions]
+    suspicions = known.kinematics.suspicions
+    doubts = [f"{baseline} is not to be believed as usual: {why}" for why in suspicions]
     monitor = Monitor(reference, alarms_per_hour)
     screen = MonitorScreen(monitor, json_file, at.quiet, _keys())
     with screen:
@@ -83,6 +84,7 @@ def monitor_robot(
         screen.show_summary()
     if monitor.finding_log.all:
         raise typer.Exit(EXIT_FINDING)
+    end_if_suspect([f"{baseline}: {why}" for why in suspicions])
 
 
 KEYS = "s stop all    h hold, or release    l light the next LED    q end"

@@ -9,6 +9,8 @@ from coordinator import inverse_dynamics, load_run
 folder, joint = sys.argv[1:]
 run = load_run(folder)
 assert run.phi is not None, "the run was made without dynamics"
+for why in run.suspicions:
+    print("not to be believed as usual:", why, file=sys.stderr)
 q_rad = np.zeros((9, len(run.serials)))
 q_rad[:, run.serials.index(joint)] = np.linspace(-np.pi, np.pi, 9)
 still = np.zeros_like(q_rad)

@@ -48,7 +48,7 @@ def test_what_the_robot_grasped_meanwhile_is_found_and_written_down(known: Path,
     assert finding["since_ns"] == pytest.approx(GRASPED_S * 1e9, abs=1e9)
 
 
-def test_a_run_whose_torques_do_not_tell_of_all_bodies_is_nothing_to_compare_with(
+def test_what_a_baseline_leaves_untold_is_refused_and_what_is_suspect_said_by_the_exit_code(
     known: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = load_baseline(known)
@@ -60,7 +60,7 @@ def test_a_run_whose_torques_do_not_tell_of_all_bodies_is_nothing_to_compare_wit
     damaged = robot._replace(kinematics=robot.kinematics._replace(damage=("a chunk is lost",)))
     monkeypatch.setattr("coordinator.commands.monitor.load_baseline", lambda folder: damaged)
     code, said = watch(str(known), "--recording", str(known / "session.mcap"))
-    assert code == 0
+    assert code == 5
     assert "is not to be believed as usual: a chunk is lost" in " ".join(said.split())
 
 

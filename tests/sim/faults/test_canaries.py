@@ -5,10 +5,13 @@ A search over the first 500 seeds has each of these. The same seeds find nothing
 
 import asyncio
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from coordinator.identification.result import Result, write_result
 from coordinator.live_robot.errors import ModuleLost
@@ -42,9 +45,11 @@ HELD = 39
 HOT = 125
 # Some messages arrive twice, which changes nothing.
 HARMLESS = 102
+# So do they to an arm that hangs, of which a short session tells the zero of its first joint.
+HARMLESS_HANGING = 7
 
 
-@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS, HOT])
+@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS, HOT, HARMLESS, HARMLESS_HANGING])
 def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
     assert found(seed) == {}
 
@@ -145,14 +150,58 @@ def test_a_session_that_waits_for_ever_is_unbounded(monkeypatch: pytest.MonkeyPa
     assert set(found(FROZEN)) == {"unbounded"}
 
 
-def test_a_result_with_a_displaced_link_is_a_wrong_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    def displace(path: Path, result: Result) -> None:
+def displaced_link(chain: Any) -> None:
+    for row in chain["imu_home"][1][:3]:
+        row[3] += 0.1
+
+
+def tilted_axis(chain: Any) -> None:
+    """About the foot of the perpendicular to the IMU, by 4 degrees: the length stays what it is."""
+    axis, point, place = (
+        np.array(chain[name][k]) for name, k in (("axis", 0), ("point", 0), ("imu_home", 1))
+    )
+    along = axis * (axis @ (place[:3, 3] - point))
+    across = place[:3, 3] - point - along
+    tilt = Rotation.from_rotvec(np.radians(4.0) * across / np.linalg.norm(across))
+    chain["point"][0], chain["axis"][0] = (point + along).tolist(), tilt.apply(axis).tolist()
+
+
+def lost_zero(chain: Any) -> None:
+    """The joint's zero is 10 degrees off: length, way across and axis stay what they are."""
+    axis, point, place = (
+        np.array(chain[name][k]) for name, k in (("axis", 0), ("point", 0), ("imu_home", 1))
+    )
+    turn = Rotation.from_rotvec(np.radians(10.0) * axis)
+    place[:3] = np.column_stack([turn.as_matrix() @ place[:3, :3], point + turn.apply(place[:3, 3] - point)])
+    chain["imu_home"][1] = place.tolist()
+
+
+def turned_gravity(chain: Any) -> None:
+    gravity = np.array(chain["gravity"])
+    aside = np.cross(gravity, chain["imu_home"][1][0][:3])
+    turn = Rotation.from_rotvec(np.radians(5.0) * aside / np.linalg.norm(aside))
+    chain["gravity"] = turn.apply(gravity).tolist()
+
+
+@pytest.mark.parametrize(
+    ("defect", "seed", "words"),
+    [
+        (displaced_link, HARMLESS, "the length is"),
+        (tilted_axis, HARMLESS, "the axis is"),
+        (lost_zero, HARMLESS_HANGING, "the tips are"),
+        (turned_gravity, HARMLESS, "gravity is"),
+    ],
+)
+def test_a_result_that_is_wrong_in_one_way_is_a_wrong_robot(
+    monkeypatch: pytest.MonkeyPatch, defect: Callable[[Any], None], seed: int, words: str
+) -> None:
+    def write(path: Path, result: Result) -> None:
         write_result(path, result)
         written = json.loads(path.read_text())
-        written["chain"]["imu_home"][1][0][3] += 0.1
-        written["chain"]["imu_home"][1][1][3] += 0.1
-        written["chain"]["imu_home"][1][2][3] += 0.1
+        defect(written["chain"])
         path.write_text(json.dumps(written))
 
-    monkeypatch.setattr("coordinator.session.run.write_result", displace)
-    assert set(found(HARMLESS)) == {"wrong robot"}
+    monkeypatch.setattr("coordinator.session.run.write_result", write)
+    violations = found(seed)
+    assert set(violations) == {"wrong robot"}
+    assert words in violations["wrong robot"]
