@@ -89,13 +89,23 @@ def pack(
     A module's observations of its own joint are left out: the catalogue gives its axis.
 
     Raises:
-        DataError: no rest observation.
+        DataError: no rest observation, or one in which an accelerometer reads nothing.
         ValueError: an unknown serial or a wrong shape.
     """
     if not rests:
         raise DataError("no rest observation: the directions to gravity are needed to assemble a chain")
     index = {serial: k for k, serial in enumerate(serials)}
     _check(index, pairs, rests)
+    for rest in rests:
+        silent = [
+            serial
+            for serial, force in zip(serials, rest.specific_force_m_s2, strict=True)
+            if not np.any(force)
+        ]
+        if silent:
+            raise DataError(
+                f"the accelerometer of {', '.join(silent)} reads nothing at rest: gravity is needed of each"
+            )
     used = [p for p in pairs if p.joint != p.observer]
     stacked = np.array([p.q_rad for p in used] + [r.q_rad for r in rests], dtype=float)
     positions, row = np.unique(stacked, axis=0, return_inverse=True)

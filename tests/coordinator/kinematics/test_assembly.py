@@ -268,6 +268,9 @@ def test_a_missing_rest_and_unknown_serials_are_refused(robots: Any) -> None:
     pairs, rest = robots.observe(chain, positions), robots.rest(chain, positions[0])
     with pytest.raises(DataError, match="gravity"):
         assemble(robots.topology(chain), types, pairs, [])
+    silent = rest._replace(specific_force_m_s2=np.array(rest.specific_force_m_s2) * [[1.0], [0.0]])
+    with pytest.raises(DataError, match="the accelerometer of M01 reads nothing at rest"):
+        assemble(robots.topology(chain), types, pairs, [rest, silent])
     with pytest.raises(ValueError, match="M99 is not in the topology"):
         assemble(robots.topology(chain), types, [pairs[0]._replace(joint="M99")], [rest])
     with pytest.raises(ValueError, match="1 module types for 2 modules"):
