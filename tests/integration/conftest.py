@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -238,6 +239,8 @@ class Client:
         self.rows: dict[str, RowLog] = {}
         self.newest_ns: dict[str, int] = {}
         self.alive: dict[str, bool] = {}
+        # How often each module has left the network, or been given up by the hub.
+        self.losses: Counter[str] = Counter()
         self.tokens: dict[str, int] = {}
         self.unreadable = 0
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
@@ -261,6 +264,7 @@ class Client:
                     self._hear(at, payload)
                 case Liveness(at, alive):
                     self.alive[parse(at).serial] = alive
+                    self.losses[parse(at).serial] += not alive
                 case Reply():
                     self._replies[event.tag] = event
 

@@ -15,14 +15,14 @@ HELD_RAD, ASKED_RAD = 0.3, 1.8
 
 
 @pytest.mark.parametrize(
-    ("frozen_s", "arrives"),
+    ("frozen_s", "given_up"),
     [
-        pytest.param(0.6, True, id="all of it arrives at once at the thaw"),
-        pytest.param(3.0, False, id="the hub has given the agent up by then"),
+        pytest.param(0.6, False, id="all of it arrives at once at the thaw"),
+        pytest.param(3.0, True, id="the hub has given the agent up by then"),
     ],
 )
 def test_nothing_that_was_sent_to_a_frozen_agent_is_executed_when_it_thaws(
-    launcher, client, frozen_s: float, arrives: bool
+    launcher, client, frozen_s: float, given_up: bool
 ) -> None:
     """On the horizontal robot gravity moves nothing, so whatever moves after the thaw was commanded."""
     robot = launcher(lifetime_ms=400)
@@ -60,9 +60,12 @@ def test_nothing_that_was_sent_to_a_frozen_agent_is_executed_when_it_thaws(
         # Streams on, now with fresh echoes: what has expired must be armed anew before it moves.
         commander.stream(serial, ASKED_RAD)
         refusals = commander.status(serial).refusals
-        return refusals.get("not_armed", 0) >= 10 and (not arrives or refusals.get("stale", 0) >= sent)
+        arrived = refusals.get("stale", 0) >= sent
+        return refusals.get("not_armed", 0) >= 10 and (arrived or commander.losses[serial] > 0)
 
     commander.until(refused, "the refusals", frozen)
+    # A machine that stalls in the short freeze may have let the hub's lease run out as well.
+    assert commander.losses[serial] > 0 or not given_up
     after = commander.status(serial)
     assert after.state == "expired"
     assert after.expiries == before.expiries + 1
