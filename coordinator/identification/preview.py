@@ -22,7 +22,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
-from coordinator.kinematics.chain_observations import PairObservation, joint_observation
+from coordinator.kinematics.chain_observations import PairObservation, RestObservation, joint_observation
 from coordinator.kinematics.simultaneous_motion import circle_observations, motion_observations
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
@@ -74,9 +74,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
         for observer in [s for s in topology.serials if s != joint]:
             pair = _pair(recording, joint, observer, topology, rest.q_rad)
             pairs += [] if pair is None else [pair]
-    types = [recording.module_type(s) for s in topology.serials]
-    fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
-    return Preview(fit, tuple(moved), adjacent(fit.chain, moved))
+    return _assembled(recording, topology, pairs, rest, moved)
 
 
 def preview_of_all(recording: Recording, event: JournalEvent, serials: Sequence[str]) -> Preview | None:
@@ -101,10 +99,24 @@ def preview_of_all(recording: Recording, event: JournalEvent, serials: Sequence[
         for pair in circle_observations(serials, response)
         if {pair.joint, pair.observer} <= set(topology.serials)
     ]
+    return _assembled(recording, topology, pairs, recording.rest_observation(topology.serials), serials)
+
+
+def _assembled(
+    recording: Recording,
+    topology: Topology,
+    pairs: Sequence[PairObservation],
+    rest: RestObservation,
+    explored: Sequence[str],
+) -> Preview:
     types = [recording.module_type(s) for s in topology.serials]
-    rest = recording.rest_observation(topology.serials)
-    fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
-    return Preview(fit, tuple(serials), adjacent(fit.chain, serials))
+    try:
+        fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            f"no chain follows from the estimates, which contradict each other ({error})"
+        ) from error
+    return Preview(fit, tuple(explored), adjacent(fit.chain, explored))
 
 
 def adjacent(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:

@@ -96,16 +96,6 @@ def pack(
         raise DataError("no rest observation: the directions to gravity are needed to assemble a chain")
     index = {serial: k for k, serial in enumerate(serials)}
     _check(index, pairs, rests)
-    for rest in rests:
-        silent = [
-            serial
-            for serial, force in zip(serials, rest.specific_force_m_s2, strict=True)
-            if not np.any(force)
-        ]
-        if silent:
-            raise DataError(
-                f"the accelerometer of {', '.join(silent)} reads nothing at rest: gravity is needed of each"
-            )
     used = [p for p in pairs if p.joint != p.observer]
     stacked = np.array([p.q_rad for p in used] + [r.q_rad for r in rests], dtype=float)
     positions, row = np.unique(stacked, axis=0, return_inverse=True)
@@ -272,6 +262,12 @@ def _check(index: dict[str, int], pairs: Sequence[PairObservation], rests: Seque
         if shape != (len(index), 3):
             raise ValueError(
                 f"specific forces have shape {shape}, ({len(index)}, 3) is needed: one row for every module"
+            )
+    for rest in rests:
+        silent = [serial for serial, k in index.items() if not np.any(rest.specific_force_m_s2[k])]
+        if silent:
+            raise DataError(
+                f"the accelerometer of {', '.join(silent)} reads nothing at rest: gravity is needed of each"
             )
 
 

@@ -300,7 +300,7 @@ class Run:
     def _begin_wanted_preview(self) -> None:
         """Begin what was asked for last, unless a preview is being computed; if it is too early, later."""
         work = self._wanted_preview
-        if work is None or not (self._preview_task is None or self._preview_task.done()):
+        if work is None or not self._may_preview():
             return
         early_s = 1e-9 * (self._next_preview_ns - self._clock())
         if early_s > 0.0:
@@ -310,6 +310,11 @@ class Run:
         self._preview_task = asyncio.create_task(self._show_preview_later(work))
         self._preview_task.add_done_callback(lambda _: self._begin_wanted_preview())
 
+    def _may_preview(self) -> bool:
+        """Return whether none is being computed, and none has ended otherwise: its error is to be raised."""
+        task = self._preview_task
+        return task is None or (task.done() and not task.cancelled() and task.exception() is None)
+
     async def _show_preview_later(self, work: Callable[[], Preview | None]) -> None:
         began_ns = self._clock()
         preview = await self._compute(lambda: self._preview(work))
@@ -317,13 +322,11 @@ class Run:
         self._show_preview(preview)
 
     def _preview(self, work: Callable[[], Preview | None]) -> Preview | None:
-        """Return a preview of the robot, None if there is none; a run does not fail for lack of one."""
+        """Return a preview of the robot, None if the data do not give one: a run goes on without."""
         try:
             return work()
-        except (DataError, KeyError) as error:
+        except DataError as error:
             logger.info("no preview of the robot: %s", error)
-        except Exception:
-            logger.exception("the preview of the robot failed")
         return None
 
     def _show_preview(self, preview: Preview | None) -> None:
@@ -333,13 +336,15 @@ class Run:
     async def _await_preview(self) -> None:
         """Wait for a preview that is still being computed, so that it does not replace a newer chain.
 
-        One that waits for its time is dropped.
+        One that waits for its time is dropped. What a preview raised is a defect of ours, and raised here.
         """
         self._wanted_preview = None
-        if self._preview_task is not None:
-            (failure,) = await asyncio.gather(self._preview_task, return_exceptions=True)
-            if isinstance(failure, Exception):
-                logger.warning("the preview of the robot could not be shown: %s", failure)
+        task = self._preview_task
+        if task is not None:
+            await asyncio.wait([task])
+            self._preview_task = None
+            if not task.cancelled():
+                task.result()
 
     async def doubts(self) -> tuple[NextMotion, ...]:
         """Return the motions to repeat to settle doubts about the topology."""
@@ -461,13 +466,15 @@ class Run:
         finally:
             self._messenger.close()
             self._writer.close()
-            await self._await_preview()
-            self._feed.close()
-            self._write_report()
-            if self._messenger.dropped:
-                self._screen.note(
-                    f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
-                )
+            try:
+                await self._await_preview()
+            finally:
+                self._feed.close()
+                self._write_report()
+                if self._messenger.dropped:
+                    self._screen.note(
+                        f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
+                    )
 
     async def _recorded(self, session: Coroutine[None, None, None]) -> None:
         """Await a session as long as it can be recorded.

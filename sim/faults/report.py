@@ -1,8 +1,10 @@
 """Outcomes of seeds: one for each, and the table of faults against outcomes."""
 
+import logging
 import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple, get_args
@@ -66,10 +68,42 @@ def run_seed(schedule: Schedule, shrinks: bool = True) -> SeedReport:
     return report._replace(simplest=_simplest(schedule, report))
 
 
+class _LoggedExceptions(logging.Handler):
+    """Collects the exceptions that a program logs with a traceback instead of ending with them."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.errors: list[BaseException] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        if error is not None:
+            self.errors.append(error)
+
+
+@contextmanager
+def _logged_exceptions() -> Iterator[list[BaseException]]:
+    """Give the list of exceptions that are logged within a block."""
+    handler = _LoggedExceptions()
+    logging.getLogger().addHandler(handler)
+    try:
+        yield handler.errors
+    finally:
+        logging.getLogger().removeHandler(handler)
+
+
+def _described(error: BaseException) -> str:
+    """Return an exception with the line of ours that it comes from."""
+    last = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in last if "site-packages" not in frame.filename] or last
+    at = f" at {Path(ours[-1].filename).name}:{ours[-1].lineno}" if ours else ""
+    return f"{type(error).__name__}{at}: {error}"
+
+
 def _judged(schedule: Schedule) -> SeedReport:
     witness = witness_of(schedule)
     violations: dict[str, str] = {}
-    with TemporaryDirectory(prefix="x5-faults-") as folder:
+    with TemporaryDirectory(prefix="x5-faults-") as folder, _logged_exceptions() as logged:
         try:
             ending = run_schedule(schedule, Path(folder) / "run", witness)
         except RobotError as error:
@@ -78,10 +112,9 @@ def _judged(schedule: Schedule) -> SeedReport:
             violations["agent died"] = str(error)
         except Exception as error:
             ending = Ending(type(error).__name__, str(error))
-            last = traceback.extract_tb(error.__traceback__)
-            ours = [frame for frame in last if "site-packages" not in frame.filename] or last
-            at = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
-            violations["traceback"] = f"{type(error).__name__} at {at}: {error}"
+            violations["traceback"] = _described(error)
+        if logged:
+            violations.setdefault("traceback", f"logged: {_described(logged[0])}")
         violations |= witness.violations | check_folder(Path(folder) / "run", ending)
     outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
     serials = schedule.robot.serials

@@ -1,4 +1,4 @@
-"""Previews of a robot being explored are computed in a thread, one at a time, and never end the run."""
+"""Previews of a robot being explored are computed in a thread, one at a time; data without one end no run."""
 
 import asyncio
 import logging
@@ -16,6 +16,7 @@ from coordinator.identification.preview import Previewer
 from coordinator.live_robot.messenger import Sender
 from coordinator.recording.journal import JournalEvent
 from coordinator.session.run import PREVIEW_EVERY_S, PREVIEW_SHARE, Run, RunConfig
+from module_agent.model.errors import DataError
 from module_agent.transport.transport import Transport
 from module_agent.wire.messages import MotionRecord, Rest
 
@@ -116,18 +117,39 @@ def test_in_virtual_time_a_preview_is_computed_before_the_call_returns(tmp_path:
     assert shown == [("A",)]
 
 
-@pytest.mark.parametrize("error", [ValueError("contradiction"), RuntimeError("a mistake of ours")])
-def test_a_failing_preview_is_logged_and_nothing_is_shown(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, error: Exception
-) -> None:
+def fail_with(error: Exception) -> Any:
     def fail(explored: Collection[str]) -> None:
         raise error
 
+    return SimpleNamespace(preview=fail)
+
+
+def test_data_that_give_no_preview_are_logged_and_nothing_is_shown(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     shown: list[Any] = []
     with caplog.at_level(logging.INFO, "coordinator.session.run"):
-        explore_until(run_of(tmp_path, SimpleNamespace(preview=fail), shown, inline=True), "A")
+        explore_until(run_of(tmp_path, fail_with(DataError("contradiction")), shown, inline=True), "A")
     assert shown == []
-    assert str(error) in caplog.text
+    assert "no preview of the robot: contradiction" in caplog.text
+
+
+def test_a_defect_of_a_preview_is_raised_once_and_no_other_preview_hides_it(tmp_path: Path) -> None:
+    with pytest.raises(KeyError, match="a mistake"):
+        explore_until(run_of(tmp_path, fail_with(KeyError("a mistake")), [], inline=True), "A")
+
+    async def explore() -> None:
+        run = run_of(tmp_path, fail_with(KeyError("a mistake")), [])
+        explore_until(run, "A")
+        assert run._preview_task is not None
+        await asyncio.wait([run._preview_task])
+        explore_until(run, "A", "B")
+        with pytest.raises(KeyError, match="a mistake"):
+            await run._await_preview()
+        # At the end of a run it is awaited again.
+        await run._await_preview()
+
+    asyncio.run(explore())
 
 
 def test_without_estimates_there_is_no_preview(tmp_path: Path) -> None:

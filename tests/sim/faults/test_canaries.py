@@ -5,6 +5,7 @@ A search over the first 500 seeds has each of these. The same seeds find nothing
 
 import asyncio
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from coordinator.identification.result import Result, write_result
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.session_file import SessionWriter
+from coordinator.session.run import Run
 from coordinator.session.session import Session
 from module_agent.firmware.firmware import Answer, Firmware
 from module_agent.hardware import motor_guard
@@ -78,6 +80,28 @@ def test_a_coordinator_with_a_defect_is_a_traceback(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("coordinator.live_robot.errors.ModuleLost.__init__", lambda *_: defect("X", "y"))
     assert set(found(FROZEN)) == {"traceback"}
+
+
+def test_a_coordinator_that_logs_a_defect_and_goes_on_is_a_traceback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def logs_and_goes_on(run: Run, preview: Any) -> None:
+        try:
+            raise KeyError("X")
+        except KeyError:
+            logging.getLogger("coordinator").exception("a defect of ours")
+
+    monkeypatch.setattr(Run, "_show_preview", logs_and_goes_on)
+    violations = found(HARMLESS)
+    assert set(violations) == {"traceback"}
+    assert "logged: KeyError at test_canaries.py" in violations["traceback"]
+
+
+def test_a_coordinator_whose_preview_has_a_defect_is_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "coordinator.identification.preview.assemble", lambda *_: np.linalg.norm("not a matrix")
+    )
+    assert set(found(HARMLESS)) == {"traceback"}
 
 
 def test_a_module_that_takes_any_proof_gets_two_holders(monkeypatch: pytest.MonkeyPatch) -> None:
