@@ -22,6 +22,7 @@ Sickness = Literal[
     "encoders_exchanged",
     "effort_sign",
     "effort_stuck",
+    "joint_gives",
     "clock_jump",
     "type_mislabelled",
     "not_finite",

@@ -18,6 +18,7 @@ from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
 from coordinator.identification.finding import Finding, SensorError
 from coordinator.identification.gear_trains import gear_trains
+from coordinator.identification.held_joints import explained, given_way
 from coordinator.identification.identified import (
     HeldOutMotion,
     IdentificationError,
@@ -317,12 +318,12 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         opposed = effort_signs(refined.chain, types, motion)
         check_opposed(opposed, signs)
         doubted = doubted_sensors(refined, prior, suspects.imus, suspects.encoders)
+        named = [f"the {e.purpose} motion of {e.serial}" for e in motions]
+        found = (*doubted, *poor_imus(refined, prior), *misfits(refined, noise, named))
         findings = (
             *opposed,
             *(one for one in geared.findings if one.serial not in {other.serial for other in doubted}),
-            *doubted,
-            *poor_imus(refined, prior),
-            *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
+            *explained(found, given_way(topology.serials, topology.unmoved, windows, noise[0], named)),
             *changed_since_rest(refined, rest.q_rad, [recording.rest_rows(s) for s in topology.serials]),
         )
     except DataError as error:

@@ -114,3 +114,18 @@ def test_a_joint_that_stood_outside_its_range_goes_back_to_the_end_of_it(tmp_pat
     run_virtual(config, between=ended.append)
     # The module brakes a little before its limit, and the motor is off in the end.
     assert 0.85 < ended[0].world.plant.q_rad[1] < 0.9
+
+
+def test_a_held_joint_that_gives_way_is_accused_and_no_healthy_imu_beyond_it(tmp_path: Path) -> None:
+    """Its limits refuse all its motions, so that the model has no axis of it; the arm's load turns it."""
+    config = VirtualConfig(
+        load_robot("arm6"),
+        tmp_path / "run",
+        network="none",
+        plan=QUICK_PLAN,
+        safety={"A-3": Safety(position_rad=(-0.05, 0.05))},
+    )
+    result = run_virtual(config)
+    assert result.suspicions
+    assert all(text.startswith("A-3: the turn of its joint") for text in result.suspicions)
+    assert result.excluded == []
