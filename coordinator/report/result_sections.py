@@ -38,8 +38,12 @@ def result_sections(result: Result, held_out: HeldOutTorques | None) -> list[Sec
 
 
 def sure_topology(result: Result) -> str:
-    """Return how sure the topology is, as a sentence."""
-    return f"Topology: {100 * result.topology_confidence:.3f} % sure."
+    """Return how sure the topology is, as a sentence, and beyond which joints nothing is known of it."""
+    sure = f"Topology: {100 * result.topology_confidence:.3f} % sure"
+    held = [one.serial for one in result.topology if not one.joint_moved]
+    if not held:
+        return f"{sure}."
+    return f"{sure}, but not what {', '.join(held)} carries: the joint did not move by itself."
 
 
 def _topology(result: Result) -> Section:

@@ -73,6 +73,16 @@ def test_a_link_of_unknown_length_is_said_and_has_no_interval(folder: Path, resu
     assert (column(lengths, "length"), column(lengths, "± 95 %")) == ([None], [None])
 
 
+def test_the_topology_beyond_a_joint_that_did_not_move_is_not_called_sure(
+    folder: Path, result: Result
+) -> None:
+    base, tip = result.topology
+    held = result.model_copy(update={"topology": [base.model_copy(update={"joint_moved": False}), tip]})
+    for one, said in ((held, True), (result, False)):
+        page = html_page(run_report(read_run(folder)._replace(result=one)))
+        assert (f"but not what {base.serial} carries" in page) is said
+
+
 def test_every_module_has_its_row_in_every_table(document: Document, result: Result) -> None:
     for title, name in (("Topology", "module"), ("Axes", "joint"), ("IMUs", "module"), ("Torques", "joint")):
         (table,) = tables(document.section(title))
