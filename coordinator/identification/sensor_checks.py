@@ -344,14 +344,16 @@ def changed_since_rest(refined: Refinement, q_rad: Array, rests: Sequence[Rows])
     """Return the IMUs that read at rest what those of the motions would not: they are others.
 
     An IMU exchanged for another one between rest and motion may fit another robot in all motions, but its
-    biases are its own. An arm that still swings when it should rest is none that has changed.
+    biases are its own. An arm that still swings when it should rest, or sinks since no joint can hold it,
+    is none that has changed.
 
     Args:
         refined: of the motions.
         q_rad: (n,) the joints' mean positions at rest. rests: the rows of every module then.
     """
-    chain, still = with_placement(refined.chain, refined.placement), np.zeros((1, len(q_rad)))
-    ideal = readings_on(chain, body_motions(chain, q_rad[None], still, still))
+    chain, steady = with_placement(refined.chain, refined.placement), np.zeros((1, len(q_rad)))
+    rate = np.array([_mean_rate(rows) for rows in rests])
+    ideal = readings_on(chain, body_motions(chain, q_rad[None], rate[None], steady))
     expected = read(refined.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
     findings = []
     for k, (serial, rows) in enumerate(zip(refined.chain.serials, rests, strict=True)):
@@ -368,6 +370,12 @@ def changed_since_rest(refined: Refinement, q_rad: Array, rests: Sequence[Rows])
                     Finding(serial, "its rest", what, there, wanted, away, unit, _OTHER, kind, True)
                 )
     return findings
+
+
+def _mean_rate(rows: Rows) -> float:
+    """Return by how much a joint turned in these rows, over their time [rad/s]; 0 by a clock that stood."""
+    turned_rad, ns = (float(rows[name][-1] - rows[name][0]) for name in ("position_rad", "t_ns"))
+    return 1e9 * turned_rad / ns if ns > 0.0 else 0.0
 
 
 def poor_imus(refined: Refinement, prior: ImuPrior) -> list[Finding]:

@@ -180,17 +180,19 @@ REST_Q = np.array([0.1, -0.4, 0.7])
 BIASES = np.array([[0.02, -0.01, 0.0], [-0.03, 0.01, 0.02], [0.0, 0.0, 0.01]])
 
 
-def at_rest() -> tuple[Any, list[Rows]]:
-    """Return the fit of an arm, and what its IMUs read in a second of rest."""
+def at_rest(sinks_rad_s: float = 0.0) -> tuple[Any, list[Rows]]:
+    """Return the fit of an arm, and what its IMUs read in a second of rest, or while its shoulder sinks."""
     chain, errors = true_chain(load_robot("a2085_03")), np.zeros((3, 34))
     errors[:, GYRO_BIAS] = BIASES
     refined = SimpleNamespace(chain=chain, placement=np.zeros((3, 6)), intrinsics=ImuIntrinsics(errors))
-    still, rng = np.zeros((1, 3)), np.random.default_rng(1)
-    force = readings_on(chain, body_motions(chain, REST_Q[None], still, still)).accel_m_s2[0]
+    rate, rng = np.array([0.0, sinks_rad_s, 0.0]), np.random.default_rng(1)
+    seen = readings_on(chain, body_motions(chain, REST_Q[None], rate[None], np.zeros((1, 3))))
     rests = [np.zeros(250, ROW) for _ in range(3)]
     for k, rows in enumerate(rests):
-        rows["gyro_rad_s"] = BIASES[k] + 1e-3 * rng.normal(size=(250, 3))
-        rows["accel_m_s2"] = force[k] + 0.02 * rng.normal(size=(250, 3))
+        rows["t_ns"] = 4_000_000 * np.arange(250)
+        rows["position_rad"] = REST_Q[k] + rate[k] * 0.004 * (np.arange(250) - 124.5)
+        rows["gyro_rad_s"] = seen.gyro_rad_s[0, k] + BIASES[k] + 1e-3 * rng.normal(size=(250, 3))
+        rows["accel_m_s2"] = seen.accel_m_s2[0, k] + 0.02 * rng.normal(size=(250, 3))
     return refined, rests
 
 
@@ -209,6 +211,14 @@ def test_an_arm_that_still_swings_when_it_should_rest_has_no_other_imus() -> Non
         # Of 3.3 swings a second the last third of one is left.
         rows["gyro_rad_s"][:, 2] += 0.2 * np.sin(2.0 * np.pi * 3.3 * np.arange(250) / 250.0)
     assert changed_since_rest(refined, REST_Q, rests) == []
+
+
+def test_an_arm_that_sinks_as_its_joints_cannot_hold_it_has_no_other_imus() -> None:
+    refined, rests = at_rest(sinks_rad_s=0.05)
+    assert changed_since_rest(refined, REST_Q, rests) == []
+    # Without its encoder, which stands, that would be another IMU.
+    rests[1]["position_rad"] = REST_Q[1]
+    assert {one.kind for one in changed_since_rest(refined, REST_Q, rests)} == {"gyro_contradicts"}
 
 
 @pytest.mark.parametrize("since", [0, 90])
