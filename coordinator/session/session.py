@@ -183,8 +183,7 @@ class Session:
         await self._step_unless_excluded("home", "all joints to their home position", self._home)
         await self._step("rest", "listening at rest", self._rest)
         if self._plan.mode == "simultaneous":
-            await self._step("explore", "exploring all joints at once", self._explore_all)
-            single = await self._single_joints() if self._single_joints is not None else ()
+            single = await self._explore_at_once()
             self._total += len(single)
             if self._times is not None:
                 self._times.explore(single)
@@ -477,6 +476,22 @@ class Session:
             await asyncio.gather(*showing, return_exceptions=True)
         for serial, record in records.items():
             self._note_motion("explore", serial, record, "whole")
+
+    async def _explore_at_once(self) -> Sequence[str]:
+        """Explore all joints at once; return those to be explored by themselves.
+
+        These are all, if a module refuses to move along: of a joint that is held the regression of all IMUs
+        on all joints tells nothing.
+        """
+        try:
+            await self._step("explore", "exploring all joints at once", self._explore_all)
+        except (Refused, MotionInterrupted) as error:
+            if not self._excluded.without(error):
+                raise
+            self._reporter.note("exploring joint by joint: not all joints can move at once")
+            await self._rearm()
+            return self._excluded.movers()
+        return await self._single_joints() if self._single_joints is not None else ()
 
     async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
         record = await self._move(f"explore/{serial}", serial, pattern, purpose)

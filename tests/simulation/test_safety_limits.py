@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.kinematics.chain_estimate import link_lengths
 from module_agent.control.controller import Command
 from module_agent.control.gains import default_gains
 from module_agent.control.safety import Safety
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import module_type
 from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
 from sim.virtual_time.robot import VirtualRobot
 from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from sim.world.world import World
@@ -129,3 +131,20 @@ def test_a_held_joint_that_gives_way_is_accused_and_no_healthy_imu_beyond_it(tmp
     assert result.suspicions
     assert all(text.startswith("A-3: the turn of its joint") for text in result.suspicions)
     assert result.excluded == []
+
+
+def test_joints_are_explored_one_by_one_if_one_cannot_move_along(tmp_path: Path) -> None:
+    """By the limits of the tip, which is still as if it were held."""
+    config = VirtualConfig(
+        load_robot("thesis_171_horizontal"),
+        tmp_path / "run",
+        plan=QUICK_PLAN.model_copy(update={"mode": "simultaneous"}),
+        safety={"X-00010": Safety(position_rad=(-0.05, 0.05))},
+    )
+    result = run_virtual(config)
+    assert result.serials == ["X-00009", "X-00010"]
+    assert {one.serial: one.joint_moved for one in result.topology} == {"X-00009": True, "X-00010": False}
+    truth = link_lengths(true_chain(config.robot), np.eye(12))[0]
+    (link,) = result.links
+    assert link.link_length_sigma_mm is not None
+    assert abs(link.link_length_mm - 1e3 * np.nanmax(truth)) < 4.0 * link.link_length_sigma_mm
