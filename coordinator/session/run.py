@@ -493,16 +493,14 @@ class Run:
             self._session = None
 
     def _write_report(self) -> None:
-        """Write the report of what there is; a run does not fail for lack of one."""
+        """Write the report of what there is; a run does not fail for want of plots or of disk space."""
         if not self._config.report or not self.recording.modules:
             return
         result = self._identified.result if self._identified is not None else None
         try:
             write_report(self._config.out, self.recording, result)
-        except MissingPlots as error:
+        except (MissingPlots, OSError) as error:
             self.note(f"no report: {error}")
-        except Exception:
-            logger.exception("the report of the run failed")
 
     async def _request_information(self) -> Kinematics | None:
         """Request the agents' torque information for the identified kinematics; return these kinematics.

@@ -1,6 +1,7 @@
 """The report of a run has every joint with the numbers of `result.json`; an early end has what there is."""
 
 import asyncio
+import errno
 import re
 import signal
 from collections.abc import Callable
@@ -302,6 +303,25 @@ def test_an_interrupted_run_leaves_a_report(tmp_path: Path) -> None:
     lines: list[str] = []
     interrupted(tmp_path / "run", lines)
     assert "The run ended early: stopped: " in (tmp_path / "run" / REPORT).read_text()
+
+
+def test_a_report_that_cannot_be_written_is_said_and_a_defect_of_it_is_raised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail_with(error: Exception) -> Callable[..., None]:
+        def write(*_: Any) -> None:
+            raise error
+
+        return write
+
+    lines: list[str] = []
+    full = OSError(errno.ENOSPC, "No space left on device", "report.html")
+    monkeypatch.setattr("coordinator.session.run.write_report", fail_with(full))
+    interrupted(tmp_path / "full", lines)
+    assert any("no report" in line and "No space left" in line for line in lines)
+    monkeypatch.setattr("coordinator.session.run.write_report", fail_with(KeyError("a mistake")))
+    with pytest.raises(KeyError, match="a mistake"):
+        interrupted(tmp_path / "mistake", [])
 
 
 def test_without_matplotlib_runs_and_replays_end_as_they_would_and_say_so(
