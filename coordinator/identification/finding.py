@@ -1,4 +1,4 @@
-"""What is wrong with a sensor: its serial, the kind of its sickness, where it shows, and how surely."""
+"""What is wrong with a sensor, or a held joint: serial, kind of sickness, where it shows, and how surely."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -47,7 +47,7 @@ UNUSABLE: frozenset[Sickness] = frozenset(
 
 
 class Finding(NamedTuple):
-    """A sensor that contradicts its catalogue or the others.
+    """A sensor that contradicts its catalogue or the others, or a joint that lets them seem to.
 
     motion: those in which it shows. measured, expected: in `unit`. sigmas: how far apart they are. remedy:
     what to check, as a phrase. kind: its sickness. serious: no claim is to be believed as usual, since the

@@ -43,7 +43,9 @@ def sure_topology(result: Result) -> str:
     held = [one.serial for one in result.topology if not one.joint_moved]
     if not held:
         return f"{sure}."
-    return f"{sure}, but not what {', '.join(held)} carries: the joint did not move by itself."
+    if len(held) == 1:
+        return f"{sure}, but not what {held[0]} carries: the joint did not move by itself."
+    return f"{sure}, but not what {', '.join(held)} carry: the joints did not move by themselves."
 
 
 def _topology(result: Result) -> Section:

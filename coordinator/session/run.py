@@ -311,7 +311,7 @@ class Run:
         self._preview_task.add_done_callback(lambda _: self._begin_wanted_preview())
 
     def _may_preview(self) -> bool:
-        """Return whether none is being computed, and none has ended otherwise: its error is to be raised."""
+        """Return whether no preview is being computed, and none has failed: its error is yet to be raised."""
         task = self._preview_task
         return task is None or (task.done() and not task.cancelled() and task.exception() is None)
 

@@ -77,11 +77,14 @@ def test_a_link_of_unknown_length_is_said_and_has_no_interval(folder: Path, resu
 def test_the_topology_beyond_a_joint_that_did_not_move_is_not_called_sure(
     folder: Path, result: Result
 ) -> None:
-    base, tip = result.topology
-    held = result.model_copy(update={"topology": [base.model_copy(update={"joint_moved": False}), tip]})
-    for one, said in ((held, True), (result, False)):
-        page = html_page(run_report(read_run(folder)._replace(result=one)))
-        assert (f"but not what {base.serial} carries" in page) is said
+    base, tip = (one.model_copy(update={"joint_moved": False}) for one in result.topology)
+    for topology, said in (
+        ([base, result.topology[1]], f"but not what {base.serial} carries: the joint did not move"),
+        ([base, tip], f"but not what {base.serial}, {tip.serial} carry: the joints did not move"),
+        (result.topology, "% sure."),
+    ):
+        shown = result.model_copy(update={"topology": topology})
+        assert said in html_page(run_report(read_run(folder)._replace(result=shown)))
 
 
 def test_every_module_has_its_row_in_every_table(document: Document, result: Result) -> None:
