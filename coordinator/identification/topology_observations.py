@@ -78,7 +78,7 @@ def respond(
     fields = ("gyro_rad_s", "accel_m_s2")
     still = StillReading(*(np.array([_mean(rows, field) for rows in rests]) for field in fields))
     motion = SimultaneousMotion(*signals.settled())
-    return simultaneous_response(motion, still, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
+    return simultaneous_response(serials, motion, still, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
 
 
 class ObservedMotions(NamedTuple):

@@ -78,20 +78,25 @@ class SimultaneousResponse(NamedTuple):
 
 
 def simultaneous_response(
-    data: SimultaneousMotion, still: StillReading, rate_hz: float, bandwidth_hz: float
+    serials: Sequence[str],
+    data: SimultaneousMotion,
+    still: StillReading,
+    rate_hz: float,
+    bandwidth_hz: float,
 ) -> SimultaneousResponse:
     """Regress all IMUs on the motion of all joints.
 
     Args:
+        serials: of the modules, as the columns.
         data: samples at `rate_hz` that begin where `still` was read.
         still: the IMUs at rest.
         rate_hz: of the samples.
         bandwidth_hz: of their low-pass; there are 2 bandwidth / rate as many independent samples.
 
     Raises:
-        DataError: a joint hardly turned, or two joints cannot be separated, with their columns.
+        DataError: a joint hardly turned, or two joints cannot be told apart; they are named.
     """
-    _check_told_apart(data.qd_rad_s)
+    _check_told_apart(serials, data.qd_rad_s)
     independent = min(1.0, 2.0 * bandwidth_hz / rate_hz)
     samples, count = data.q_rad.shape
     gyro = data.gyro_rad_s - still.gyro_rad_s
@@ -147,18 +152,18 @@ def circle_observations(serials: Sequence[str], response: SimultaneousResponse) 
     return pairs
 
 
-def _check_told_apart(qd_rad_s: Array) -> None:
+def _check_told_apart(serials: Sequence[str], qd_rad_s: Array) -> None:
     size = np.sqrt(np.mean(qd_rad_s**2, axis=0))
     if size.min() < MIN_RATE_RAD_S:
         raise DataError(
-            f"the joint in column {int(size.argmin())} turned at only {size.min():.2g} rad/s rms while all "
-            f"moved; {MIN_RATE_RAD_S} are needed"
+            f"joint {serials[int(size.argmin())]} turned at only {size.min():.2g} rad/s rms while all moved, "
+            f"{MIN_RATE_RAD_S} are needed: its motor is dead, or something held it"
         )
     alike = np.abs(qd_rad_s.T @ qd_rad_s) / len(qd_rad_s) / np.outer(size, size) - np.eye(len(size))
     if alike.max() > 0.9:
-        i, k = np.unravel_index(int(alike.argmax()), alike.shape)
+        i, k = (int(index) for index in np.unravel_index(int(alike.argmax()), alike.shape))
         raise DataError(
-            f"the joints in columns {i} and {k} moved alike (correlation {alike.max():.2f}): give them "
+            f"joints {serials[i]} and {serials[k]} moved alike (correlation {alike.max():.2f}): give them "
             "frequencies of their own"
         )
 

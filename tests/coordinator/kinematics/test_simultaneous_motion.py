@@ -56,7 +56,7 @@ def moved(chain: Chain, seed: int, noise: float = 1.0) -> tuple[SimultaneousMoti
 
 
 def answered(chain: Chain, seed: int) -> SimultaneousResponse:
-    return simultaneous_response(*moved(chain, seed), RATE_HZ, 15.0)
+    return simultaneous_response(chain.serials, *moved(chain, seed), RATE_HZ, 15.0)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -103,7 +103,7 @@ def test_the_refinement_ends_where_it_would_have_ended_from_the_true_robot(
 ) -> None:
     chain, types = robots.random(20 + seed, joints=6, serial=True)
     data, still = moved(chain, seed)
-    response = simultaneous_response(data, still, RATE_HZ, 15.0)
+    response = simultaneous_response(chain.serials, data, still, RATE_HZ, 15.0)
     topology = find_topology(motion_observations(chain.serials, response))
     rest = robots.rest(chain, np.zeros(6))
     first = assemble(topology, types, circle_observations(chain.serials, response), [rest])
@@ -127,7 +127,8 @@ def test_without_noise_the_gyro_answers_a_single_joint_exactly(robots: SimpleNam
     qdd = np.concatenate([alone.qdd_rad_s2, np.zeros_like(alone.q_rad)], axis=1)
     gyro, accel = imu_readings(chain, q, qd, qdd)
     seen = alone._replace(gyro_rad_s=gyro[:, 1:], accel_m_s2=accel[:, 1:])
-    response = simultaneous_response(seen, StillReading(np.zeros((1, 3)), accel[:1, 1]), RATE_HZ, 15.0)
+    still = StillReading(np.zeros((1, 3)), accel[:1, 1])
+    response = simultaneous_response(chain.serials[1:], seen, still, RATE_HZ, 15.0)
     axis, radial = robots.circle(chain, 0, 1, np.zeros(2))
     np.testing.assert_allclose(response.axis[0, 0], axis, atol=1e-9)
     # Integrating the gyro by the trapezoid rule at 250 Hz turns gravity wrongly by some microradians.
@@ -138,13 +139,13 @@ def test_joints_that_moved_alike_are_named() -> None:
     q, qd, qdd = multi_sines(3)
     qd[:, 2] = 2.0 * qd[:, 0]
     data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
-    with pytest.raises(DataError, match="columns 0 and 2 moved alike"):
-        simultaneous_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
+    with pytest.raises(DataError, match="joints A and C moved alike"):
+        simultaneous_response("ABC", data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
 
 
 def test_a_joint_that_did_not_turn_is_named() -> None:
     q, qd, qdd = multi_sines(3)
     qd[:, 1] = 0.0
     data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
-    with pytest.raises(DataError, match=r"column 1 turned at only 0 rad/s"):
-        simultaneous_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
+    with pytest.raises(DataError, match=r"joint B turned at only 0 rad/s"):
+        simultaneous_response("ABC", data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
