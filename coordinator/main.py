@@ -45,7 +45,7 @@ EXAMPLES = {
     "identify": "x5-coordinator identify shoulder --robot my_arm",
     "keys": "x5-coordinator keys shoulder elbow --robot my_arm --out keys",
     "view": "x5-coordinator view runs/my_arm --serve",
-    "screenshot": "x5-coordinator screenshot runs/my_arm/session.rrd --out my_arm.png",
+    "screenshot": "x5-coordinator screenshot runs/my_arm --out my_arm.png",
     "check": "x5-coordinator check runs/my_arm --out runs/checked",
     "payload": "x5-coordinator payload runs/my_arm --out runs/loaded",
     "merge": "x5-coordinator merge runs/monday runs/tuesday --out runs/both",

@@ -5,11 +5,12 @@ from typing import Annotated
 
 import typer
 
+from coordinator.recording.run_folder import view_of
 from coordinator.viewer.screenshot import screenshot as picture
 
 
 def screenshot(
-    recording: Annotated[Path, typer.Argument(help="A session.rrd.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or a session.rrd.")],
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
     tab: Annotated[str | None, typer.Option(help="Tab to show.")] = None,
     at: Annotated[
@@ -18,4 +19,4 @@ def screenshot(
     ] = None,
 ) -> None:
     """Render a recording as the viewer shows it, without a screen."""
-    picture(recording, out, tab, at_s=at)
+    picture(view_of(run), out, tab, at_s=at)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.recording.run_folder import VIEW
+from coordinator.recording.run_folder import view_of
 from coordinator.runtime.event_loop import SIGNALS
 from coordinator.viewer import viewer_process
 from coordinator.viewer.page import Page
@@ -36,9 +36,7 @@ def view(
     ] = None,
 ) -> None:
     """Show the recording of a run; the viewer's window stays open, a served page until Ctrl-C."""
-    recording = run / VIEW if run.is_dir() else run
-    if not recording.is_file():
-        raise UsageError(f"{recording}: there is no such recording; a run writes {VIEW} into its folder")
+    recording = view_of(run)
     if not viewer_process.is_recording(recording):
         raise UsageError(f"{recording} is not a Rerun recording: it does not begin with 'RRF'")
     if port is not None and not serve:

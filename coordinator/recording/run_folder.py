@@ -40,6 +40,18 @@ def check_free(path: Path) -> None:
         raise RunFolderError(f"{path} holds a run already: choose another --out, or --resume it")
 
 
+def view_of(run: Path) -> Path:
+    """Return what the viewer shows of a run, by its folder or that file itself.
+
+    Raises:
+        RunFolderError: there is no such file.
+    """
+    recording = run / VIEW if run.is_dir() else run
+    if not recording.is_file():
+        raise RunFolderError(f"{recording}: there is no such recording; a run writes {VIEW} into its folder")
+    return recording
+
+
 def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path | None:
     """Make the folder; return the recording of the crashed run to `resume` from, if there is one.
 

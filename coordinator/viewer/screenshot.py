@@ -46,13 +46,13 @@ def screenshot(
 
     Raises:
         OSError: the recording cannot be read, or the picture not be written.
-        ScreenshotFailed: no software Vulkan, not a recording of a run, or the viewer did not settle.
-        UsageError: there is no such tab, or the time is before or after the recording.
+        ScreenshotFailed: no software Vulkan, or the viewer did not settle.
+        UsageError: no recording of a run, no such tab, or a time before or after the recording.
     """
     if tab is not None and tab not in TABS:
         raise UsageError(f"no tab {tab!r}; there are {', '.join(TABS)}")
     if not is_recording(rrd):
-        raise ScreenshotFailed(f"{rrd} is not a Rerun recording: it does not begin with {MAGIC.decode()!r}")
+        raise UsageError(f"{rrd} is not a Rerun recording: it does not begin with {MAGIC.decode()!r}")
     port = viewer_process.free_port()
     options = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
     try:

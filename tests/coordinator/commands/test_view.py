@@ -25,12 +25,14 @@ from coordinator.viewer.targets import ViewerTargets, proxy_url
 from coordinator.viewer.viewer import Viewer
 
 
-def test_what_is_no_recording_is_refused_with_what_is_expected(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["view", str(tmp_path)])
+@pytest.mark.parametrize("command", ["view", "screenshot"])
+def test_what_is_no_recording_is_refused_with_what_is_expected(tmp_path: Path, command: str) -> None:
+    options = ["--out", str(tmp_path / "run.png")] if command == "screenshot" else []
+    done = CliRunner().invoke(app, [command, str(tmp_path), *options])
     assert done.exit_code == 2
     assert f"{tmp_path / VIEW}: there is no such recording" in done.output
     (tmp_path / VIEW).write_text("a text")
-    done = CliRunner().invoke(app, ["view", str(tmp_path)])
+    done = CliRunner().invoke(app, [command, str(tmp_path), *options])
     assert done.exit_code == 2
     assert "is not a Rerun recording" in done.output
 

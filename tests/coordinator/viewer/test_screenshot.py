@@ -45,7 +45,7 @@ def test_a_tab_or_recording_that_does_not_exist_is_reported_before_a_viewer_star
     with pytest.raises(FileNotFoundError, match=r"run\.rrd"):
         screenshot(tmp_path / "run.rrd", tmp_path / "run.png")
     (tmp_path / "run.rrd").write_text("a text")
-    with pytest.raises(ScreenshotFailed, match="not a Rerun recording"):
+    with pytest.raises(UsageError, match="not a Rerun recording"):
         screenshot(tmp_path / "run.rrd", tmp_path / "run.png")
 
 
