@@ -456,7 +456,9 @@ class Run:
             if identified.held_out is not None:
                 self._feed.held_out(identified.held_out)
             self._feed.result(self._clock(), result_markdown(identified.result))
-            self._feed.step(self._clock(), "done")
+            why = "; ".join(identified.result.suspicions)
+            doubt = f"; the result is not to be believed as usual: {why}" if why else ""
+            self._feed.step(self._clock(), f"done{doubt}")
             self._identified = identified
             for line in identified.inertia.summary() if identified.inertia is not None else ():
                 self._screen.note(line)

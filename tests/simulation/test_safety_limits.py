@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from coordinator.kinematics.chain_estimate import link_lengths
+from coordinator.viewer.feed import ViewerFeed
 from module_agent.control.controller import Command
 from module_agent.control.gains import default_gains
 from module_agent.control.safety import Safety
@@ -118,8 +119,12 @@ def test_a_joint_that_stood_outside_its_range_goes_back_to_the_end_of_it(tmp_pat
     assert 0.85 < ended[0].world.plant.q_rad[1] < 0.9
 
 
-def test_a_held_joint_that_gives_way_is_accused_and_no_healthy_imu_beyond_it(tmp_path: Path) -> None:
+def test_a_held_joint_that_gives_way_is_accused_and_no_healthy_imu_beyond_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its limits refuse all its motions, so that the model has no axis of it; the arm's load turns it."""
+    shown = list[str]()
+    monkeypatch.setattr(ViewerFeed, "step", lambda feed, session_ns, text: shown.append(text))
     config = VirtualConfig(
         load_robot("arm6"),
         tmp_path / "run",
@@ -131,6 +136,7 @@ def test_a_held_joint_that_gives_way_is_accused_and_no_healthy_imu_beyond_it(tmp
     assert result.suspicions
     assert all(text.startswith("A-3: the turn of its joint") for text in result.suspicions)
     assert result.excluded == []
+    assert shown[-1].startswith("done; the result is not to be believed as usual: A-3")
 
 
 def test_joints_are_explored_one_by_one_if_one_cannot_move_along(tmp_path: Path) -> None:
