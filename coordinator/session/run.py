@@ -268,8 +268,9 @@ class Run:
         self._feed.step(self._clock(), f"{index} of {total}: {text}")
 
     def note(self, text: str) -> None:
-        """Show a line of text."""
+        """Show a line of text, in the viewer's log as well."""
         self._screen.note(text)
+        self._feed.note(self._clock(), text)
 
     def estimates(self, joint: str) -> None:
         """Show the modules' estimates of a joint, and a preview of the robot."""
@@ -364,13 +365,13 @@ class Run:
             self._config.gate.learn(self._chain)
         self._feed.chain(self._clock(), kinematics.fit)
         for line in kinematics.summary():
-            self._screen.note(line)
+            self.note(line)
 
     async def excitation(self) -> tuple[RobotMotion, ...]:
         """Design excitation motions of all joints at once for the identified chain; none if it is suspect."""
         assert self._chain is not None, "all joints are explored before any is excited"
         if self._explored is not None and self._explored.suspicions:
-            self._screen.note("exciting joint by joint: what was explored is not to be believed as usual")
+            self.note("exciting joint by joint: what was explored is not to be believed as usual")
             return ()
         chain, plan, gate = self._chain, self._config.plan, self._config.gate
         allowed = None if gate is None else gate.allows
@@ -378,7 +379,7 @@ class Run:
         try:
             return await self._compute(lambda: robot_excitation(chain, modules, plan, allowed=allowed))
         except NoExcitation as error:
-            self._screen.note(f"{error}; exciting joint by joint instead")
+            self.note(f"{error}; exciting joint by joint instead")
             return ()
 
     async def _single_joints(self) -> Sequence[str]:
@@ -388,7 +389,7 @@ class Run:
             return ()
         changes = difference(self._baseline.kinematics.topology, topology)
         for line in changes.summary():
-            self._screen.note(line)
+            self.note(line)
         return joints_to_explore(topology, changes)
 
     async def _kinematics(self) -> Kinematics:
@@ -441,7 +442,7 @@ class Run:
             self._writer.close()
             if self._writer.failure is not None:
                 raise self._writer.failure
-            self._screen.note("estimating")
+            self.note("estimating")
             identified = await self._compute(
                 lambda: identify(
                     self.recording,
@@ -461,7 +462,7 @@ class Run:
             self._feed.step(self._clock(), f"done{doubt}")
             self._identified = identified
             for line in identified.inertia.summary() if identified.inertia is not None else ():
-                self._screen.note(line)
+                self.note(line)
             if self._crashed is not None:
                 self._crashed.unlink()
             return identified.result
@@ -502,7 +503,7 @@ class Run:
         try:
             write_report(self._config.out, self.recording, result)
         except (MissingPlots, OSError) as error:
-            self.note(f"no report: {error}")
+            self._screen.note(f"no report: {error}")
 
     async def _request_information(self) -> Kinematics | None:
         """Request the agents' torque information for the identified kinematics; return these kinematics.

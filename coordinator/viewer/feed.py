@@ -72,6 +72,7 @@ class ViewerFeed:
         self._network_ns: dict[str, int] = {}
         self._known: tuple[str, ...] = ()
         self._origin_ns = 0
+        self._begun = False
         # The newest estimates, each valid until there is a newer one.
         self._shown: dict[tuple[str, str], Estimate] = {}
         self._shown_ns = 0
@@ -92,7 +93,7 @@ class ViewerFeed:
 
     def begin(self, session_ns: int) -> None:
         """Set the beginning of the session, from which the viewer's time counts."""
-        self._origin_ns = session_ns
+        self._origin_ns, self._begun = session_ns, True
 
     def _gather(self, feedback: Feedback) -> None:
         """Note which rows were received; the rows themselves are in the recording."""
@@ -169,6 +170,11 @@ class ViewerFeed:
         """Show that a step begins, and the present estimates again, so that their lines reach this step."""
         self._viewer.phase(session_ns - self._origin_ns, text)
         self._show_again(session_ns)
+
+    def note(self, session_ns: int, text: str) -> None:
+        """Show a line on the step that is under way; before the session begins there is no time for it."""
+        if self._begun:
+            self._viewer.note(session_ns - self._origin_ns, text)
 
     def _show_again(self, session_ns: int) -> None:
         self._shown_ns = session_ns

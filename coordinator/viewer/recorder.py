@@ -120,6 +120,11 @@ class Recorder:
         heading = rr.TextDocument(f"**{text}**\n\n{LEGEND}", media_type="text/markdown")
         self._stream.log(entity_paths.PHASE_NOW, heading)
 
+    def note(self, t_ns: int, text: str) -> None:
+        """Log a line on the step that is under way, indented as in a terminal."""
+        self._set_time(t_ns)
+        self._stream.log(entity_paths.PHASE_LOG, rr.TextLog(f"  {text}", level=rr.TextLogLevel.INFO))
+
     def network(self, serial: str, t_ns: int, round_trip_ms: float, age_ms: float, refusals: int) -> None:
         """Log the state of a module's connection."""
         self._register([serial])

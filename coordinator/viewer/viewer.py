@@ -103,6 +103,10 @@ class Viewer:
         """Show the step that begins, in the log and above the robot."""
         self._submit(lambda recorder: recorder.phase(t_ns, text))
 
+    def note(self, t_ns: int, text: str) -> None:
+        """Show a line on the step that is under way, in the log."""
+        self._submit(lambda recorder: recorder.note(t_ns, text))
+
     def network(self, serial: str, t_ns: int, round_trip_ms: float, age_ms: float, refusals: int) -> None:
         """Show a module's round trip, the age of its newest sample and its refusals so far."""
         self._submit(

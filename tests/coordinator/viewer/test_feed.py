@@ -161,3 +161,12 @@ def test_the_robot_turns_thirty_times_a_second_as_its_newest_rows_say(rig: Rig) 
     assert times[-1] > 3_900 * MS
     assert [q for _, q in rig.viewer.turned] == [[round((t - 2 * MS) / (4 * MS))] for t in times.tolist()]
     assert rig.viewer.calls[-1] == "close"
+
+
+def test_notes_are_shown_at_their_time_in_the_session_from_its_beginning_on(rig: Rig) -> None:
+    noted = list[tuple[int, str]]()
+    rig.viewer.note = lambda *line: noted.append(line)
+    rig.feed.note(7, "before there is a session")
+    rig.feed.begin(10)
+    rig.feed.note(25, "going on without B")
+    assert noted == [(15, "going on without B")]

@@ -176,11 +176,13 @@ def test_held_out_torque_and_its_residual(viewer: Viewer, file: Path, read: Read
 def test_steps_network_and_topology_are_at_their_times(viewer: Viewer, file: Path, read: Read) -> None:
     viewer.modules(["a", "b"], {"a": "X5-9", "b": "X5-1"})
     viewer.phase(3, "discover")
+    viewer.note(4, "found 2: a, b")
     viewer.network("b", 4, 1.5, 6.0, 2)
     viewer.topology(5, ["a", "b"], [-1, 0], [False, True])
     done(viewer)
     log = read(file, "/phase/log")
-    assert (times_ns(log), log["/phase/log:TextLog:text"][0][0]) == ([3], "discover")
+    lines = [line[0] for line in log["/phase/log:TextLog:text"]]
+    assert (times_ns(log), lines) == ([3, 4], ["discover", "  found 2: a, b"])
     assert column(read(file, "/network/b/age"), "/network/b/age:Scalars:scalars").tolist() == [[6.0]]
     assert column(read(file, "/network/b/refusals"), "/network/b/refusals:Scalars:scalars").tolist() == [
         [2.0]
