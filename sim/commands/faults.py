@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from coordinator.commands.options import JsonFile
@@ -91,6 +92,13 @@ def faults(
         "suspicions name what happened",
         err=json_file == STANDARD_OUTPUT,
     )
+    claims = [one.widest_claim_mm for one in reports if one.widest_claim_mm is not None]
+    if claims:
+        typer.echo(
+            f"lengths of {len(claims)} right robots are claimed to {np.median(claims):.1f} mm (the widest of "
+            f"each, median), {max(claims):.1f} mm at most",
+            err=json_file == STANDARD_OUTPUT,
+        )
     if violated:
         raise typer.Exit(EXIT_FINDING)
 

@@ -1,5 +1,6 @@
 """What must hold of every session, whatever happened in it."""
 
+import json
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -47,6 +48,15 @@ def check_folder(out: Path, ending: Ending) -> dict[str, str]:
             if wrong:
                 violations["wrong robot"] = wrong
     return violations
+
+
+def widest_claim_mm(out: Path) -> float | None:
+    """Return the largest sigma that a result claims of the length of a link; None if it claims none.
+
+    No error is beyond a claim that is wide enough: so the search reports how wide claims are.
+    """
+    sigmas = (link["link_length_sigma_mm"] for link in json.loads((out / RESULT).read_bytes())["links"])
+    return max((sigma for sigma in sigmas if sigma is not None), default=None)
 
 
 def is_misnamed(schedule: Schedule, ending: Ending) -> bool:

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, get_args
 
 from module_agent.model.errors import RobotError
 from sim.faults.fault import KINDS
-from sim.faults.invariants import check_folder, is_misnamed
+from sim.faults.invariants import check_folder, is_misnamed, widest_claim_mm
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import Schedule, simpler
 from sim.physics.engine import Physics
@@ -32,6 +32,7 @@ class SeedReport(NamedTuple):
     of an invariant.
     named_rightly: whether an error or a suspicion names a fault that had begun, None without either.
     simplest: the simplest session found that violates the same invariant, None if none was looked for.
+    widest_claim_mm: the largest sigma of a link's length in the right robot; None without one.
     """
 
     seed: int
@@ -48,6 +49,7 @@ class SeedReport(NamedTuple):
     simplest: "SeedReport | None" = None
     physics: Physics = "compiled"
     expects: bool = True
+    widest_claim_mm: float | None = None
 
     def options(self, robot: str | None = None) -> str:
         """Return the options of `x5-sim faults` that repeat it; `robot` is the robot as the user gave it."""
@@ -116,6 +118,8 @@ def _judged(schedule: Schedule) -> SeedReport:
         if logged:
             violations.setdefault("traceback", f"logged: {_described(logged[0])}")
         violations |= witness.violations | check_folder(Path(folder) / "run", ending)
+        is_right = ending.name == "result" and not violations
+        claim = widest_claim_mm(Path(folder) / "run") if is_right else None
     outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
     serials = schedule.robot.serials
     begun = [fault for fault in schedule.faults if fault.begins_s <= ending.at_s]
@@ -133,6 +137,7 @@ def _judged(schedule: Schedule) -> SeedReport:
         violations=violations,
         physics=schedule.physics,
         expects=schedule.expects,
+        widest_claim_mm=claim,
         named_rightly=named if outcome in ("named", "misnamed", "suspect") and not violations else None,
     )
 

@@ -32,6 +32,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(report, "run_schedule", run_schedule)
     monkeypatch.setattr(report, "check_folder", lambda out, ending: {})
+    monkeypatch.setattr(report, "widest_claim_mm", lambda out: 1.5)
     monkeypatch.setattr(faults, "run_trials", one_after_another)
 
 
@@ -69,6 +70,7 @@ def test_seeds_without_violation_end_with_zero() -> None:
     found = CliRunner().invoke(app, ["faults", "--seeds", "7..7"])
     assert found.exit_code == 0
     assert "1 seeds, 0 with violations" in found.output
+    assert "lengths of 1 right robots are claimed to 1.5 mm" in found.output
 
 
 @pytest.mark.usefixtures("in_this_process")

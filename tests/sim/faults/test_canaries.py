@@ -56,6 +56,15 @@ def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
     assert found(seed) == {}
 
 
+def test_a_right_robot_tells_how_wide_its_claims_are() -> None:
+    """Which no invariant bounds: a claim that is wide enough is never wrong."""
+    claim = run_seed(draw(HARMLESS)).widest_claim_mm
+    # Short motions and the catalogue's places of IMUs leave some millimetres.
+    assert claim is not None
+    assert 0.5 < claim < 10.0
+    assert run_seed(draw(FROZEN)).widest_claim_mm is None
+
+
 def test_firmware_that_does_not_expire_drives_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Firmware, "_expire", lambda firmware: None)
     monkeypatch.setattr("module_agent.firmware.firmware.Lease.lapsed", lambda lease, now_ns: False)
