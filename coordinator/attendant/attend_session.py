@@ -111,6 +111,8 @@ class AttendSession:
                     f"{why}. Identify the robot anew, or attend it without --may-move"
                 )
             self._say(f"{known.folder} is not to be believed as usual: {why}")
+        for remark in reference.remarks:
+            self._say(remark)
         serials = reference.chain.serials
         attendant = Attendant(serials, self._measurer is not None, self._patience)
         self._say(f"attends {known.name}, version {self._versions.current_number}: {', '.join(serials)}")

@@ -172,17 +172,19 @@ def _drives(
 def _structure(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
 ) -> Detection | None:
-    chain = reference.chain
+    chain, test = reference.chain, reference.imu
+    if test is None:
+        return None
     # At rest an IMU shows which way is down, by its own errors and in whatever pose, and no length.
     if not chain.linked or 2 * sum(segment.moved for segment in window) < len(window):
         return None
     parts = [segment.imu for segment in window]
-    found = reference.imu.find(imu_window(reference.imu_model, parts))
+    found = test.find(imu_window(reference.imu_model, parts))
     most = most_of(found)
     best, child = found[most], chain.linked[most]
     if best.gain < thresholds.link:
         return None
-    sensor = imu_error(reference.imu, reference.imu_model, parts)
+    sensor = imu_error(test, reference.imu_model, parts)
     if sensor.gain > best.gain + LEAD:
         return sensor.detection(chain.serials[sensor.place], thresholds.link)
     turn, shift = displacement(chain, child, best.size)

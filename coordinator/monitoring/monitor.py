@@ -23,7 +23,15 @@ from coordinator.monitoring.diagnosis import (
 )
 from coordinator.monitoring.findings import IMU_SENSORS, STRUCTURAL, STRUCTURE, Finding, FindingLog, Key
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, SPANS, Reference, Thresholds, thresholds
-from coordinator.monitoring.segments import SEGMENT_S, Alignment, Block, DataSegment, Gap, Segmenter
+from coordinator.monitoring.segments import (
+    SEGMENT_S,
+    Alignment,
+    Block,
+    DataSegment,
+    Gap,
+    Segmenter,
+    without_offsets,
+)
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array
@@ -108,7 +116,8 @@ class Monitor:
             notes += self._hindered(aligned.gaps, aligned.silent)
             notes += self._timed(clocks)
             if aligned.block is not None:
-                found, dropped, said = self._look(aligned.block)
+                block = without_offsets(aligned.block, self.reference.torque_offset_nm)
+                found, dropped, said = self._look(block)
                 findings += found
                 withdrawn += dropped
                 notes += said

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, STEP_NS
 from module_agent.model.chain import Array
-from module_agent.model.read_only import make_read_only
+from module_agent.model.read_only import make_read_only, read_only
 from module_agent.signals.autocorrelation import autocovariance
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import (
@@ -192,6 +192,11 @@ def joined_blocks(blocks: Sequence[Block]) -> Block:
 def part_of(block: Block, begin: int, end: int) -> Block:
     """Return some samples of a block."""
     return Block(block.t_ns[begin:end], *(column[begin:end] for column in block[1:]))
+
+
+def without_offsets(block: Block, offset_nm: Array) -> Block:
+    """Return a block with the torque sensors' offsets (n,) [Nm] taken off."""
+    return block._replace(tau_nm=read_only(block.tau_nm - offset_nm))
 
 
 SEGMENT_SAMPLES = 125
