@@ -1,8 +1,16 @@
-"""A run tells how torques add up if several joints moved at once in it."""
+"""What a run tells of a robot that is well: how its torques add up, and its torque sensors' offsets."""
 
 import numpy as np
+import pytest
 
-from coordinator.monitoring.reference import moved_together
+from coordinator.dynamics.inertia_prior import module_prior
+from coordinator.dynamics.pseudo_inertia import parameters
+from coordinator.monitoring.reference import fitted_torques, moved_together
+from coordinator.monitoring.segments import DataSegment
+from module_agent.model.catalogue import TorqueKind
+from module_agent.model.chain import Array
+from module_agent.model.regressor import inverse_dynamics
+from tests.coordinator.monitoring.moving_arm import CHAIN, JOINTS, KINDS, PHI, segments
 
 STILL = np.full((125, 2), 0.01)
 FIRST, SECOND = (
@@ -27,3 +35,44 @@ def test_two_of_six_joints_that_move_at_once_do_not_show_how_all_of_them_move() 
 
 def test_a_single_joint_has_none_to_move_with() -> None:
     assert moved_together([FIRST[:, :1]])
+
+
+# What sensors of the first joint, which carries all, and of the last read of nothing [Nm].
+OFFSETS_NM = np.array([0.08, 0.0, -0.08])
+
+
+def test_offsets_of_torque_sensors_are_measured_and_not_taken_for_weight() -> None:
+    # In this motion gravity turns in the last joint's frame by some tenths of a radian, later by much more.
+    known = [one._replace(tau_nm=one.tau_nm + OFFSETS_NM) for one in segments(11, 40)]
+    _, offsets = fitted_torques(CHAIN, KINDS, "uncalibrated", known)
+    # Noise of 0.05 Nm in 5,000 samples is 1 mNm, and gravity hides as much again.
+    np.testing.assert_allclose(offsets, OFFSETS_NM, atol=5e-3)
+    assert _wrong_elsewhere("uncalibrated", known) < 0.01
+    # The control: who knows of no offsets is wrong by about as much as they are.
+    assert _wrong_elsewhere("calibrated", known) > 0.04
+
+
+def test_what_no_motion_shows_is_as_the_catalogue_has_it() -> None:
+    # An arm at rest does not show its inertia about the vertical.
+    still = [
+        one._replace(qd_rad_s=0.0 * one.qd_rad_s, qdd_rad_s2=0.0 * one.qdd_rad_s2) for one in segments(12, 10)
+    ]
+    still = [one._replace(tau_nm=_torques(PHI, one)) for one in still]
+    phi, _ = fitted_torques(CHAIN, KINDS, "calibrated", still)
+    catalogued = np.concatenate([parameters(one) for one in module_prior(CHAIN, KINDS)])
+    turning = np.zeros((1, JOINTS)), np.zeros((1, JOINTS)), np.array([[1.0, 0.0, 0.0]])
+    inertia, expected = (inverse_dynamics(CHAIN, one, *turning)[0, 0] for one in (phi, catalogued))
+    assert inertia == pytest.approx(expected, rel=0.05)
+    assert inertia > 0.01
+
+
+def _torques(phi: Array, one: DataSegment) -> Array:
+    return inverse_dynamics(CHAIN, phi, one.q_rad, one.qd_rad_s, one.qdd_rad_s2)
+
+
+def _wrong_elsewhere(kind: TorqueKind, known: list[DataSegment]) -> float:
+    """Return how wrong a fit's torque of the last joint is in other poses: its largest error but its mean."""
+    phi, _ = fitted_torques(CHAIN, KINDS, kind, known)
+    others = [one._replace(q_rad=one.q_rad * 4.0) for one in segments(13)]
+    error = np.concatenate([_torques(phi, one) - _torques(PHI, one) for one in others])[:, -1]
+    return float(np.abs(error - error.mean()).max())
