@@ -404,68 +404,10 @@ class Run:
 
     async def run(self) -> Result:
         """Run to the end and write the files; on any error the recording on disk is complete."""
-        config = self._config
         try:
             self._messenger.start()
-            self._journal(
-                JournalEvent(
-                    t_ns=self._clock(),
-                    what="session",
-                    robot=config.robot,
-                    imu=config.plan.imu,
-                    torque=config.plan.torque,
-                )
-            )
-            session = Session(
-                self._group,
-                self._messenger,
-                self.recording,
-                config.plan,
-                self._clock,
-                self._journal,
-                self,
-                self._single_joints if self._baseline is not None else None,
-                lambda: self._requests.collect(self._group.serials),
-            )
-            await self._recorded(session.run(config.expect))
-            kinematics = await self._request_information()
-            self._journal(
-                JournalEvent(
-                    t_ns=self._clock(),
-                    what="finished",
-                    wall_time_s=time.monotonic() - self._started_s,
-                    cpu_us_per_message=self._messenger.cpu_us_per_message,
-                )
-            )
-            # Nothing more is recorded: a replay must read exactly what this result is computed from.
-            self._messenger.close()
-            self._writer.close()
-            if self._writer.failure is not None:
-                raise self._writer.failure
-            self.note("estimating")
-            identified = await self._compute(
-                lambda: identify(
-                    self.recording,
-                    revise=self._with_baseline,
-                    kinematics=kinematics,
-                    measured=self._measured,
-                    explored=self._explored,
-                )
-            )
-            write_outputs(config.out, identified)
-            self._feed.chain(self._clock(), identified.kinematics.fit)
-            if identified.held_out is not None:
-                self._feed.held_out(identified.held_out)
-            self._feed.result(self._clock(), result_markdown(identified.result))
-            why = "; ".join(identified.result.suspicions)
-            doubt = f"; the result is not to be believed as usual: {why}" if why else ""
-            self._feed.step(self._clock(), f"done{doubt}")
-            self._identified = identified
-            for line in identified.inertia.summary() if identified.inertia is not None else ():
-                self.note(line)
-            if self._crashed is not None:
-                self._crashed.unlink()
-            return identified.result
+            kinematics = await self._record_session()
+            return await self._evaluate(kinematics)
         finally:
             self._messenger.close()
             self._writer.close()
@@ -478,6 +420,77 @@ class Run:
                     self._screen.note(
                         f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
                     )
+
+    async def _record_session(self) -> Kinematics | None:
+        """Let the session go through and end its recording; return the kinematics that agents were told.
+
+        Raises:
+            NotRecorded: not all of it could be recorded.
+        """
+        config = self._config
+        self._journal(
+            JournalEvent(
+                t_ns=self._clock(),
+                what="session",
+                robot=config.robot,
+                imu=config.plan.imu,
+                torque=config.plan.torque,
+            )
+        )
+        session = Session(
+            self._group,
+            self._messenger,
+            self.recording,
+            config.plan,
+            self._clock,
+            self._journal,
+            self,
+            self._single_joints if self._baseline is not None else None,
+            lambda: self._requests.collect(self._group.serials),
+        )
+        await self._recorded(session.run(config.expect))
+        kinematics = await self._request_information()
+        self._journal(
+            JournalEvent(
+                t_ns=self._clock(),
+                what="finished",
+                wall_time_s=time.monotonic() - self._started_s,
+                cpu_us_per_message=self._messenger.cpu_us_per_message,
+            )
+        )
+        # Nothing more is recorded: a replay must read exactly what this result is computed from.
+        self._messenger.close()
+        self._writer.close()
+        if self._writer.failure is not None:
+            raise self._writer.failure
+        return kinematics
+
+    async def _evaluate(self, kinematics: Kinematics | None) -> Result:
+        """Identify the robot from the recording, write the outputs and show the result."""
+        self.note("estimating")
+        identified = await self._compute(
+            lambda: identify(
+                self.recording,
+                revise=self._with_baseline,
+                kinematics=kinematics,
+                measured=self._measured,
+                explored=self._explored,
+            )
+        )
+        write_outputs(self._config.out, identified)
+        self._feed.chain(self._clock(), identified.kinematics.fit)
+        if identified.held_out is not None:
+            self._feed.held_out(identified.held_out)
+        self._feed.result(self._clock(), result_markdown(identified.result))
+        why = "; ".join(identified.result.suspicions)
+        doubt = f"; the result is not to be believed as usual: {why}" if why else ""
+        self._feed.step(self._clock(), f"done{doubt}")
+        self._identified = identified
+        for line in identified.inertia.summary() if identified.inertia is not None else ():
+            self.note(line)
+        if self._crashed is not None:
+            self._crashed.unlink()
+        return identified.result
 
     async def _recorded(self, session: Coroutine[None, None, None]) -> None:
         """Await a session as long as it can be recorded.
