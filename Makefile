@@ -60,7 +60,7 @@ dynamics: $(DEV)
 # A night: what is over is kept, and the same command continues.
 watch: $(STAMP)
 	@mkdir -p runs
-	$(BIN)/x5-sim watch --excitation d-optimal --hours 100 --trials 3 --out runs/watch --json runs/watch.json
+	$(BIN)/x5-sim watch --hours 100 --trials 3 --out runs/watch --json runs/watch.json
 
 thesis: $(STAMP)
 	$(BIN)/x5-sim thesis --quick --out runs/thesis

@@ -103,7 +103,7 @@ class AttendSession:
             BaselineError, UnsuitableBaseline, VersionError: the folder holds nothing to compare with.
         """
         known = await self._site.compute(lambda: load_baseline(self._versions.folder))
-        reference = await self._site.compute(lambda: build_reference(known))
+        reference = await self._reference(known)
         if why := "; ".join(known.kinematics.suspicions):
             if self._measurer is not None:
                 raise UnsuitableBaseline(
@@ -111,8 +111,6 @@ class AttendSession:
                     f"{why}. Identify the robot anew, or attend it without --may-move"
                 )
             self._say(f"{known.folder} is not to be believed as usual: {why}")
-        for remark in reference.remarks:
-            self._say(remark)
         serials = reference.chain.serials
         attendant = Attendant(serials, self._measurer is not None, self._patience)
         self._say(f"attends {known.name}, version {self._versions.current_number}: {', '.join(serials)}")
@@ -120,7 +118,14 @@ class AttendSession:
             assert self._measurer is not None, "an attendant that may not move wants no measurement"
             outcome, known = await self._measurer.measure(wanted, known)
             self._take(attendant.ended(self._site.clock(), wanted, outcome))
-            reference = await self._site.compute(lambda: build_reference(known))  # noqa: B023 - awaited here
+            reference = await self._reference(known)
+
+    async def _reference(self, known: BaselineRobot) -> Reference:
+        """Return what to compare with, and say what it leaves open."""
+        reference = await self._site.compute(lambda: build_reference(known))
+        for remark in reference.remarks:
+            self._say(remark)
+        return reference
 
     async def _watch(
         self, attendant: Attendant, reference: Reference, until_ns: int | None

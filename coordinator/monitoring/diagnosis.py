@@ -105,7 +105,8 @@ class Diagnosis(NamedTuple):
 def segment_information(reference: Reference, segment: DataSegment) -> SegmentInformation:
     """Return what a stretch says."""
     drives = tuple(
-        drive_evidence(model, segment, joint) for joint, model in enumerate(reference.drive_models)
+        None if test is None else drive_evidence(model, segment, joint)
+        for joint, (model, test) in enumerate(zip(reference.drive_models, reference.drives, strict=True))
     )
     return SegmentInformation(
         int(segment.t_ns[0]),
@@ -285,9 +286,10 @@ def weighed(
 
 def unexplained(reference: Reference, thresholds: Thresholds, load: LoadShift) -> Detection:
     """Return torques that no payload on one body explains."""
+    link = "" if reference.imu is not None else "a link is displaced, "
     summary = (
         "the torques have changed in a way that no payload on one body explains: something holds the robot, "
-        "several things were added, or a joint's torque sensor is off"
+        f"several things were added, {link}or a joint's torque sensor is off"
     )
     serial = reference.chain.serials[load.carrier]
     return Detection("unexplained", serial, 0.0, 0.0, load.gain, thresholds.payload, summary)

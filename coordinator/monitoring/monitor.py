@@ -270,6 +270,9 @@ class Monitor:
             detection = unexplained(self.reference, self.thresholds, load)
         elif load is not None and kind == "payload":
             detection = weighed(self.reference, self.thresholds, hypothesis.window, load)
+            if detection is None and self.reference.imu is None and self._agreed_for >= UNEXPLAINED_AFTER:
+                # It has no mass: a link that is displaced, which no IMU is asked for.
+                detection = unexplained(self.reference, self.thresholds, load)
         return [] if detection is None else log.put(detection.finding(self._since_ns, now_ns))
 
     def _adapted(self, hypothesis: _Hypothesis, now_ns: int) -> list[Key]:
@@ -322,11 +325,13 @@ class Monitor:
             return []
         self._untimed = poor
         if not poor:
-            return ["all clocks are accurate again: all tests are active"]
+            return ["all clocks are accurate again: the tests go on"]
+        drives = any(self.reference.drives)
+        left = "only friction is watched, each drive by itself" if drives else "nothing is watched"
+        sigma_ms, needed_ms = 1e-6 * max(sigmas.values()), 1e-6 * WORST_CLOCK_NS
         return [
             f"the network is slow: when {', '.join(poor)} read what they say is known to "
-            f"{1e-6 * max(sigmas.values()):.1f} ms only, and {1e-6 * WORST_CLOCK_NS:.1f} ms are needed; only "
-            "friction is watched, each drive by itself"
+            f"{sigma_ms:.1f} ms only, and {needed_ms:.1f} ms are needed; {left}"
         ]
 
     def _hindered(self, gaps: Sequence[Gap], silent: tuple[str, ...]) -> list[str]:

@@ -1,22 +1,22 @@
 """What a robot was when it was well, with all that the watch needs: models, noise, thresholds.
 
-Everything comes from the recording of one run. The run is looked at as the watch looks at a robot: in
-stretches of half a second, whatever was moving. What the tests find in one part of it against all the rest
-is what they find in a robot that has not changed; by that their noise is inflated.
+All but the prior of its bodies comes from the recording of one run. The run is looked at as the watch looks
+at a robot: in stretches of half a second, whatever was moving. What the tests find in one part of it against
+all the rest is what they find in a robot that has not changed; by that their noise is inflated.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import lstsq
+from scipy.linalg import block_diag, lstsq
 from scipy.special import chdtri
 
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import with_placement
 from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuIntrinsics
 from coordinator.dynamics.inertia_prior import module_prior
-from coordinator.dynamics.pseudo_inertia import parameter_scale, parameters
+from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_transform, parameters
 from coordinator.monitoring.contact import ContactModel, FastPart, contact_model
 from coordinator.monitoring.likelihood_ratio import (
     Change,
@@ -48,7 +48,9 @@ from coordinator.monitoring.residual_tests import (
 )
 from coordinator.monitoring.segments import (
     SEGMENT_S,
+    SEGMENT_SAMPLES,
     Alignment,
+    Block,
     DataSegment,
     Segmenter,
     noise_level,
@@ -56,14 +58,22 @@ from coordinator.monitoring.segments import (
     without_offsets,
 )
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE
-from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ
-from module_agent.model.catalogue import ModuleType, TorqueKind
+from coordinator.recording.journal import since_joined
+from coordinator.synchronisation.motion_windows import (
+    INDEPENDENT_FRACTION,
+    RATE_HZ,
+    dynamic_windows,
+    filtered_window,
+    joined_motions,
+)
+from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.errors import UsageError
+from module_agent.model.errors import DataError, UsageError
 from module_agent.model.imu_prior import IMU_PRIORS
-from module_agent.model.information import JointInformation, compress, merge
-from module_agent.model.read_only import read_only
-from module_agent.model.regressor import PER_BODY, torque_regressor
+from module_agent.model.information import JointInformation, gather, merge
+from module_agent.model.read_only import make_read_only
+from module_agent.model.regressor import PER_BODY
+from module_agent.signals.filtering import JointMotion
 
 # How long a window of the watch is, in stretches.
 WINDOW = 10
@@ -80,15 +90,12 @@ ALONE_FACTOR = 2.5
 _ALONE_JOINTS = 3
 # A joint moves in a stretch if it is faster than that in it.
 _MOVES_RAD_S = 0.1
-# Standard deviation of a body as the catalogue has it, per `parameter_scale`: a bracket, a cable, a gripper.
+# Standard deviation of a catalogued body, per `parameter_scale` about its centre of mass: what brackets,
+# cables and a tool add.
 BODY_SIGMA_KG = 0.1
 # The noise of the torques settles in as many rounds.
 _ROUNDS = 3
 _NO_NOISE = 1e-9
-# A joint that travels while another one returns does not show how all of them move.
-_TOGETHER_SHARE = 0.1
-# Of a robot's first torques, as its arm falls into its springs, nothing is expected.
-_FIRST_S = 1.0
 
 
 class UnsuitableBaseline(UsageError):
@@ -146,7 +153,7 @@ class Reference(NamedTuple):
             return ()
         others = "" if self.imu is not None else ", and neither links, IMUs nor friction are monitored"
         return (
-            f"the run that {self.name} is known from moved its joints one at a time: torques are compared "
+            f"the run that {self.name} is known from hardly moved its joints together: torques are compared "
             f"{ALONE_FACTOR:.1f} times as coarsely as after a run with --excitation d-optimal{others}",
         )
 
@@ -164,26 +171,21 @@ def build_reference(known: BaselineRobot) -> Reference:
         why = "; ".join(known.kinematics.suspicions)
         raise UnsuitableBaseline(f"{known.folder} does not tell the robot's inertia: {why}")
     types = tuple(recording.module_type(serial) for serial in chain.serials)
-    aligned = Alignment(chain.serials).advance(recording, known.kinematics.clocks)
-    if aligned.block is None:
-        lost = ", ".join(f"module {h.serial}" for h in aligned.gaps) or "a module"
-        raise UnsuitableBaseline(f"{known.folder}: its recording has a hole in the rows of {lost}")
-    block = part_of(aligned.block, round(_FIRST_S * RATE_HZ), len(aligned.block.t_ns))
+    motions, block = _well_known(known)
+    phi, offset_nm = fitted_torques(chain, types, joined_motions(motions))
+    block = without_offsets(block, offset_nm)
     segments = Segmenter().add(block)
     if len(segments) < MIN_WINDOWS * WINDOW:
         raise UnsuitableBaseline(
-            f"{known.folder} lasts {0.5 * len(segments):.0f} s: too short to tell what is normal; "
-            f"at least {0.5 * MIN_WINDOWS * WINDOW:.0f} s are needed"
+            f"{known.folder} lasts {SEGMENT_S * len(segments):.0f} s: too short to tell what is normal; "
+            f"at least {SEGMENT_S * MIN_WINDOWS * WINDOW:.0f} s are needed"
         )
-    phi, offset_nm = fitted_torques(chain, types, recording.torque, segments)
-    block = without_offsets(block, offset_nm)
-    segments = Segmenter().add(block)
-    together = moved_together([one.qd_rad_s for one in segments])
+    together = moved_together([one.qd_rad_s for one in motions])
     factor = 1.0 if together else ALONE_FACTOR
-    bodies_known = together or len(chain.serials) <= _ALONE_JOINTS
     sigma, information, torque = _torque(chain, phi, segments)
-    model, imu = _imu(known, segments)
+    model = _imu_model(known, segments)
     drives = [_drive(kind, segments, joint) for joint, kind in enumerate(types)]
+    compared = together or len(types) <= _ALONE_JOINTS
     outside = MomentumObserver(chain, phi).advance(block.q_rad, block.qd_rad_s, block.tau_nm)
     return Reference(
         name=known.name,
@@ -195,71 +197,101 @@ def build_reference(known: BaselineRobot) -> Reference:
         information=information,
         torque=torque._replace(inflation=factor**2 * torque.inflation),
         imu_model=model,
-        imu=imu if bodies_known else None,
+        imu=_imu_test(model, segments) if compared else None,
         drive_models=tuple(drive for drive, _ in drives),
-        drives=tuple(test if bodies_known else None for _, test in drives),
+        drives=tuple(test if compared else None for _, test in drives),
         contact=contact_model(factor * FastPart().advance(outside)),
         together=together,
     )
 
 
-def moved_together(speeds_rad_s: Sequence[Array]) -> bool:
-    """Return whether half of the joints, two at least, moved at once in a tenth of the stretches.
+def _well_known(known: BaselineRobot) -> tuple[list[JointMotion], Block]:
+    """Return the motions for inertia, and all samples from the run's first step to its last.
 
-    speeds_rad_s: (m, n) of every stretch. A single joint always did.
+    Before and after these the motors may be off, and the robot may lie on whatever is there.
+
+    Raises:
+        UnsuitableBaseline: something of it was not recorded.
     """
-    joints = speeds_rad_s[0].shape[1]
-    moving = [np.count_nonzero(np.abs(one).max(axis=0) > _MOVES_RAD_S) for one in speeds_rad_s]
-    several = np.count_nonzero(np.array(moving) >= max(2, -(-joints // 2)))
-    return bool(joints == 1 or several >= _TOGETHER_SHARE * len(moving))
+    recording, clocks, serials = known.recording, known.kinematics.clocks, known.chain.serials
+    try:
+        windows = dynamic_windows(recording, clocks, serials, "dynamic")
+    except DataError as error:
+        raise UnsuitableBaseline(f"{known.folder}: {error}") from error
+    aligned = Alignment(serials).advance(recording, clocks)
+    if aligned.block is None:
+        lost = ", ".join(f"module {h.serial}" for h in aligned.gaps) or "a module"
+        raise UnsuitableBaseline(f"{known.folder}: its recording has a hole in the rows of {lost}")
+    steps = [e.t_ns for e in since_joined(recording.journal) if e.what in ("begin", "motion", "done")]
+    begin, end = np.searchsorted(aligned.block.t_ns, [min(steps), max(steps)])
+    return [filtered_window(one) for one in windows], part_of(aligned.block, int(begin), int(end))
 
 
-def fitted_torques(
-    chain: Chain, types: Sequence[ModuleType], kind: TorqueKind, segments: Sequence[DataSegment]
-) -> tuple[Array, Array]:
+def moved_together(motions: Sequence[Array]) -> bool:
+    """Return whether half of the joints, two at least, moved at once in half of the time that any moved.
+
+    motions: their speeds [rad/s], (m, n) each. A single joint always did.
+    """
+    joints = motions[0].shape[1]
+    parts = [one[k : k + SEGMENT_SAMPLES] for one in motions for k in range(0, len(one), SEGMENT_SAMPLES)]
+    moving = np.array([np.count_nonzero(np.abs(one).max(axis=0) > _MOVES_RAD_S) for one in parts])
+    several = np.count_nonzero(moving >= max(2, -(-joints // 2)))
+    return bool(joints == 1 or several >= 0.5 * np.count_nonzero(moving))
+
+
+def fitted_torques(chain: Chain, types: Sequence[ModuleType], motion: JointMotion) -> tuple[Array, Array]:
     """Return the bodies' parameters phi (10 n,) and the offsets o (n,) [Nm] of the torque sensors.
 
-    They are the most probable ones, with the catalogue's phi_0 and no offset as Gaussian priors,
+    They are the most probable ones by a motion's independent samples, with the catalogue's bodies phi_0 and
+    no offsets as Gaussian priors,
 
         minimise sum |tau - Y phi - o|^2 / sigma_tau^2 + |phi - phi_0|^2 / sigma_phi^2 + |o|^2 / sigma_o^2,
 
-    and sigma_tau (n,) from the residual. Without offsets the fit would take that of a joint with little load
-    for weight of the bodies beyond it, and be wrong in all other poses; without the prior it would have what
-    the motions determine weakly, which are not the robot's later ones, from noise.
+    sigma_tau (n,) from the residual. Without offsets the fit takes that of a joint with little load for
+    weight of the bodies beyond it, and is wrong in all other poses; without the prior it has from noise what
+    the motion determines weakly, and other motions more.
     """
-    joints, bodies = len(chain.serials), PER_BODY * len(chain.serials)
-    information = merge(*(_with_offset(chain, one) for one in segments))
-    expected = np.concatenate([parameters(one) for one in module_prior(chain, types)])
-    largest_nm = np.array([one.max_effort_nm for one in types])
-    sigmas = np.concatenate([BODY_SIGMA_KG * parameter_scale(joints), OFFSET_SHARE[kind] * largest_nm])
-    found = np.concatenate([expected, np.zeros(joints)])
+    joints, bodies = len(types), PER_BODY * len(types)
+    prior = module_prior(chain, types)
+    expected = np.concatenate([*map(parameters, prior), np.zeros(joints)])
+    offset_sigmas = np.diag([OFFSET_SHARE["uncalibrated"] * one.max_effort_nm for one in types])
+    spread = block_diag(*map(_body_spread, prior), offset_sigmas)
     rows, target = [], []
+    information = gather(
+        chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm, with_offset=True
+    )
     for joint, piece in enumerate(information):
-        own = np.zeros((len(piece.z), bodies + joints))
-        own[:, :bodies], own[:, bodies + joint] = piece.r[:, :bodies], piece.r[:, bodies]
-        rows.append(own * sigmas)
-        target.append(piece.z - own @ found)
-    deviation = np.zeros_like(found)
+        columns = np.zeros((len(piece.z), bodies + joints))
+        columns[:, :bodies], columns[:, bodies + joint] = piece.r[:, :bodies], piece.r[:, bodies]
+        rows.append(columns @ spread)
+        target.append(piece.z - columns @ expected)
+    phi, offset_nm = np.split(expected + spread @ _most_probable(rows, target, information), [bodies])
+    make_read_only((phi, offset_nm))
+    return phi, offset_nm
+
+
+def _body_spread(prior: Array) -> Array:
+    """Return one standard deviation of a body's parameters in every direction, (10, 10), from its prior."""
+    centre = np.eye(4)
+    centre[:3, 3] = prior[:3, 3] / prior[3, 3]
+    return np.asarray(BODY_SIGMA_KG * parameter_transform(centre) * parameter_scale(1))
+
+
+def _most_probable(
+    rows: Sequence[Array], target: Sequence[Array], information: Sequence[JointInformation]
+) -> Array:
+    """Return the parameters, in standard deviations of their prior, by rows of unknown noise."""
+    size = rows[0].shape[1]
+    estimate = np.zeros(size)
     for _ in range(_ROUNDS):
-        left = [
-            np.sum((z - r @ deviation) ** 2) + piece.rest
-            for r, z, piece in zip(rows, target, information, strict=True)
-        ]
-        weights = [
-            np.sqrt(INDEPENDENT_FRACTION * piece.samples / max(one, _NO_NOISE))
-            for one, piece in zip(left, information, strict=True)
-        ]
-        known = np.vstack([*(w * r for w, r in zip(weights, rows, strict=True)), np.eye(found.size)])
-        seen = np.concatenate([*(w * z for w, z in zip(weights, target, strict=True)), np.zeros(found.size)])
-        deviation = np.asarray(lstsq(known, seen, check_finite=False)[0])
-    found = found + sigmas * deviation
-    return read_only(found[:bodies].copy()), read_only(found[bodies:].copy())
-
-
-def _with_offset(chain: Chain, one: DataSegment) -> tuple[JointInformation, ...]:
-    """Return the information about phi, and in one more column about every joint's own offset."""
-    regressor = torque_regressor(chain, one.q_rad, one.qd_rad_s, one.qdd_rad_s2)
-    return compress(np.concatenate([regressor, np.ones((*one.tau_nm.shape, 1))], axis=2), one.tau_nm)
+        stacked, wanted = [np.eye(size)], [np.zeros(size)]
+        for own, own_target, piece in zip(rows, target, information, strict=True):
+            misfit = float(np.sum((own_target - own @ estimate) ** 2)) + piece.rest
+            weight = np.sqrt(INDEPENDENT_FRACTION * piece.samples / max(misfit, _NO_NOISE))
+            stacked.append(weight * own)
+            wanted.append(weight * own_target)
+        estimate = np.asarray(lstsq(np.vstack(stacked), np.concatenate(wanted), check_finite=False)[0])
+    return estimate
 
 
 def _torque(
@@ -276,7 +308,7 @@ def _torque(
     return independent, whole, test
 
 
-def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuModel, BaselineTest]:
+def _imu_model(known: BaselineRobot, segments: Sequence[DataSegment]) -> ImuModel:
     refinement, count = known.kinematics.refinement, len(known.chain.serials)
     chain = with_placement(known.chain, refinement.placement)
     # Delays are each segment's own.
@@ -284,11 +316,14 @@ def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuMode
     errors[:, DELAY] = 0.0
     rough = ImuModel(chain, ImuIntrinsics(errors), IMU_PRIORS[known.imu], np.full((count, 6), 0.05))
     sigma, counted = noise_level(lasting_residual(rough, segments))
-    model = rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
+    return rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
+
+
+def _imu_test(model: ImuModel, segments: Sequence[DataSegment]) -> BaselineTest:
     evidence = [
         imu_window(model, [imu_evidence(model, one) for one in window]) for window in _windows(segments)
     ]
-    return model, _calibrated(evidence, model.prior_sigma, link_changes(chain))
+    return _calibrated(evidence, model.prior_sigma, link_changes(model.chain))
 
 
 def _drive(

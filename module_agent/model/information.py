@@ -58,9 +58,16 @@ def compress(regressor: ArrayLike, tau_nm: ArrayLike) -> tuple[JointInformation,
 
 
 def gather(
-    chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike, tau_nm: ArrayLike
+    chain: Chain,
+    q_rad: ArrayLike,
+    qd_rad_s: ArrayLike,
+    qdd_rad_s2: ArrayLike,
+    tau_nm: ArrayLike,
+    with_offset: bool = False,
 ) -> tuple[JointInformation, ...]:
     """Return the information of every joint from a motion, all (m, n), without holding its whole regressor.
+
+    with_offset: one more column, behind those of the bodies, is of the joint's own constant torque.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -74,7 +81,10 @@ def gather(
 
     def block(part: slice) -> tuple[JointInformation, ...]:
         motion = [signal[part] for signal in signals]
-        return compress(torque_regressor(chain, *motion, out=buffer[: len(motion[0])]), tau[part])
+        rows = torque_regressor(chain, *motion, out=buffer[: len(motion[0])])
+        if with_offset:
+            rows = np.concatenate([rows, np.ones((*rows.shape[:2], 1))], axis=2)
+        return compress(rows, tau[part])
 
     return reduce(merge, map(block, parts))
 

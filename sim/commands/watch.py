@@ -44,7 +44,7 @@ def watch(
     noise: ProfileName = DEFAULT_PROFILE,
     excitation: Annotated[
         Excitation, typer.Option(help="Of the run that a robot is known from, as of `x5-coordinator run`.")
-    ] = "joint-by-joint",
+    ] = "d-optimal",
     hours: Annotated[
         float, typer.Option(min=0.0, max=10_000.0, help="Time in which nothing changes, all robots together.")
     ] = 1.0,

@@ -30,6 +30,15 @@ def test_without_leave_to_move_it_says_what_was_put_on_and_what_left(known_arm: 
     assert all(host.modules[0].firmware.state == "idle" for host in scene.robot.hosts.values())
 
 
+def test_what_the_run_leaves_open_is_said(
+    known_arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda motions: False)
+    scene = Scene(known_arm, tmp_path / "arm")
+    scene.plays(4.0)
+    assert scene.ears.heard("hardly moved its joints together")
+
+
 @pytest.mark.parametrize("name", ["0.2 kg put on", "a module exchanged", "a module added"])
 def test_what_has_changed_is_measured_again_and_the_new_model_holds(
     name: str, known_arm: Path, tmp_path: Path

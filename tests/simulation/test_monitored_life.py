@@ -7,6 +7,8 @@ from coordinator.monitoring.findings import Kind
 from coordinator.monitoring.reference import ALONE_FACTOR
 from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, known_robot_of, monitored_life
 from sim.benchmark.slow_change import ChangeKind
+from sim.imperfections.module_errors import draw_sensor_errors
+from sim.imperfections.noise_profile import noise_profile
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("monitored life")
@@ -67,10 +69,46 @@ def test_a_run_of_one_joint_at_a_time_is_compared_more_coarsely_and_says_so(
 ) -> None:
     known = PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True
     together = known_robot_of(*known).reference
-    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda speeds_rad_s: False)
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda motions: False)
     alone = known_robot_of.__wrapped__(*known).reference
     assert together.remarks == ()
-    assert "one at a time" in alone.remarks[0]
+    assert "hardly moved its joints together" in alone.remarks[0]
+    assert "neither links" not in alone.remarks[0]
     np.testing.assert_allclose(alone.contact.sigma_nm, ALONE_FACTOR * together.contact.sigma_nm)
     # Gains are squares of sizes.
     assert alone.torque.inflation == pytest.approx(ALONE_FACTOR**2 * together.torque.inflation)
+
+
+def test_of_a_long_arm_that_moved_one_joint_at_a_time_only_torques_are_compared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda motions: False)
+    monkeypatch.setattr("coordinator.monitoring.reference._ALONE_JOINTS", 2)
+    known = known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True)
+    assert known.reference.imu is None
+    assert known.reference.drives == (None, None, None)
+    assert "neither links, IMUs nor friction are monitored" in known.reference.remarks[0]
+    monkeypatch.setattr("sim.benchmark.monitored_life.known_robot_of", lambda *_: known)
+    changes: tuple[ChangeKind, ...] = ("friction", "link")
+    stiff, displaced = (
+        monitored_life(PLAN._replace(change=kind, for_s=45.0, from_s=12.0, over_s=10.0)) for kind in changes
+    )
+    assert not stiff.said
+    assert not {one.kind for one in displaced.said} & {"wear", "gyro", "accelerometer"}
+
+
+def test_torque_sensors_offsets_are_known_from_the_run_and_taken_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, "x5-uncalibrated", PLAN.excitation, True)
+    reference, serials = known.reference, known.robot.serials
+    types = [reference.types[reference.chain.serials.index(serial)] for serial in serials]
+    errors = draw_sensor_errors(PLAN.seed, serials, types, noise_profile("x5-uncalibrated"))
+    truth = dict(zip(serials, errors.effort_offset_nm, strict=True))
+    off_nm = np.array([truth[serial] for serial in reference.chain.serials]) - reference.torque_offset_nm
+    # Of the second joint, which bears the arm, weight and offset are told apart less well.
+    np.testing.assert_array_less(np.abs(off_nm), [5e-3, 0.03, 5e-3])
+    # The control: what a monitor takes off that is no offset, it reports.
+    wrong = reference._replace(torque_offset_nm=reference.torque_offset_nm + np.array([0.0, 0.0, 1.0]))
+    monkeypatch.setattr(
+        "sim.benchmark.monitored_life.known_robot_of", lambda *_: known._replace(reference=wrong)
+    )
+    assert monitored_life(PLAN._replace(noise="x5-uncalibrated")).said

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from coordinator.dynamics.inertia_prior import module_prior
-from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.monitoring.reference import fitted_torques, moved_together
 from coordinator.monitoring.segments import DataSegment
-from module_agent.model.catalogue import TorqueKind
+from coordinator.parameter_fit.least_squares import solve_weighted
+from coordinator.synchronisation.motion_windows import joined_motions
 from module_agent.model.chain import Array
+from module_agent.model.information import gather
 from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import JointMotion
 from tests.coordinator.monitoring.moving_arm import CHAIN, JOINTS, KINDS, PHI, segments
 
 STILL = np.full((125, 2), 0.01)
@@ -22,9 +23,10 @@ def test_joints_that_move_one_after_the_other_do_not_move_together() -> None:
     assert not moved_together([STILL, FIRST, STILL, SECOND])
 
 
-def test_a_tenth_of_the_stretches_in_which_half_of_the_joints_move_is_enough() -> None:
-    assert moved_together([*[STILL, FIRST, SECOND] * 3, FIRST + SECOND])
-    assert not moved_together([*[STILL, FIRST, SECOND] * 4, FIRST + SECOND])
+def test_joints_that_move_at_once_half_of_the_time_that_any_moves_move_together() -> None:
+    both = FIRST + SECOND
+    assert moved_together([*[STILL] * 9, both, np.concatenate([FIRST, both, STILL, SECOND, both])])
+    assert not moved_together([FIRST, both, SECOND])
 
 
 def test_two_of_six_joints_that_move_at_once_do_not_show_how_all_of_them_move() -> None:
@@ -44,35 +46,50 @@ OFFSETS_NM = np.array([0.08, 0.0, -0.08])
 def test_offsets_of_torque_sensors_are_measured_and_not_taken_for_weight() -> None:
     # In this motion gravity turns in the last joint's frame by some tenths of a radian, later by much more.
     known = [one._replace(tau_nm=one.tau_nm + OFFSETS_NM) for one in segments(11, 40)]
-    _, offsets = fitted_torques(CHAIN, KINDS, "uncalibrated", known)
+    _, offsets = fitted_torques(CHAIN, KINDS, _joined(known))
     # Noise of 0.05 Nm in 5,000 samples is 1 mNm, and gravity hides as much again.
     np.testing.assert_allclose(offsets, OFFSETS_NM, atol=5e-3)
-    assert _wrong_elsewhere("uncalibrated", known) < 0.01
-    # The control: who knows of no offsets is wrong by about as much as they are.
-    assert _wrong_elsewhere("calibrated", known) > 0.04
+    assert _wrong_elsewhere(fitted_torques(CHAIN, KINDS, _joined(known))[0]) < 0.01
+    # The control: a fit that has no offsets is wrong by about as much as they are.
+    motion = _joined(known)
+    information = gather(CHAIN, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
+    assert _wrong_elsewhere(solve_weighted(information).phi) > 0.04
 
 
-def test_what_no_motion_shows_is_as_the_catalogue_has_it() -> None:
+def test_what_no_motion_shows_is_by_the_catalogue_and_the_weight() -> None:
     # An arm at rest does not show its inertia about the vertical.
     still = [
         one._replace(qd_rad_s=0.0 * one.qd_rad_s, qdd_rad_s2=0.0 * one.qdd_rad_s2) for one in segments(12, 10)
     ]
-    still = [one._replace(tau_nm=_torques(PHI, one)) for one in still]
-    phi, _ = fitted_torques(CHAIN, KINDS, "calibrated", still)
-    catalogued = np.concatenate([parameters(one) for one in module_prior(CHAIN, KINDS)])
+    motion = _joined([one._replace(tau_nm=_torques(PHI, one)) for one in still])
+    # Its weight says how much heavier it is than the catalogue's modules without links: a fifth here.
+    assert _about_the_vertical(fitted_torques(CHAIN, KINDS, motion)[0]) == pytest.approx(
+        _about_the_vertical(PHI), rel=0.1
+    )
+    # The control: least squares have no inertia at all.
+    information = gather(CHAIN, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
+    assert abs(_about_the_vertical(solve_weighted(information).phi)) < 1e-3
+
+
+def _about_the_vertical(phi: Array) -> float:
+    """Return the arm's inertia about the axis of its first joint."""
     turning = np.zeros((1, JOINTS)), np.zeros((1, JOINTS)), np.array([[1.0, 0.0, 0.0]])
-    inertia, expected = (inverse_dynamics(CHAIN, one, *turning)[0, 0] for one in (phi, catalogued))
-    assert inertia == pytest.approx(expected, rel=0.05)
-    assert inertia > 0.01
+    return float(inverse_dynamics(CHAIN, phi, *turning)[0, 0])
 
 
 def _torques(phi: Array, one: DataSegment) -> Array:
     return inverse_dynamics(CHAIN, phi, one.q_rad, one.qd_rad_s, one.qdd_rad_s2)
 
 
-def _wrong_elsewhere(kind: TorqueKind, known: list[DataSegment]) -> float:
-    """Return how wrong a fit's torque of the last joint is in other poses: its largest error but its mean."""
-    phi, _ = fitted_torques(CHAIN, KINDS, kind, known)
+def _joined(parts: list[DataSegment]) -> JointMotion:
+    """Return stretches as one motion."""
+    return joined_motions(
+        [JointMotion(*(getattr(one, name) for name in JointMotion._fields)) for one in parts]
+    )
+
+
+def _wrong_elsewhere(phi: Array) -> float:
+    """Return how wrong the torque of the last joint is in other poses: its largest error but its mean."""
     others = [one._replace(q_rad=one.q_rad * 4.0) for one in segments(13)]
     error = np.concatenate([_torques(phi, one) - _torques(PHI, one) for one in others])[:, -1]
     return float(np.abs(error - error.mean()).max())
