@@ -270,9 +270,6 @@ class Monitor:
             detection = unexplained(self.reference, self.thresholds, load)
         elif load is not None and kind == "payload":
             detection = weighed(self.reference, self.thresholds, hypothesis.window, load)
-            if detection is None and self.reference.imu is None and self._agreed_for >= UNEXPLAINED_AFTER:
-                # It has no mass: a link that is displaced, which no IMU is asked for.
-                detection = unexplained(self.reference, self.thresholds, load)
         return [] if detection is None else log.put(detection.finding(self._since_ns, now_ns))
 
     def _adapted(self, hypothesis: _Hypothesis, now_ns: int) -> list[Key]:

@@ -1,6 +1,6 @@
 """What a robot was when it was well, with all that the watch needs: models, noise, thresholds.
 
-All but the prior of its bodies comes from the recording of one run. The run is looked at as the watch looks
+All but priors comes from the recording of one run. The run is looked at as the watch looks
 at a robot: in stretches of half a second, whatever was moving. What the tests find in one part of it against
 all the rest is what they find in a robot that has not changed; by that their noise is inflated.
 """
@@ -48,7 +48,6 @@ from coordinator.monitoring.residual_tests import (
 )
 from coordinator.monitoring.segments import (
     SEGMENT_S,
-    SEGMENT_SAMPLES,
     Alignment,
     Block,
     DataSegment,
@@ -58,7 +57,7 @@ from coordinator.monitoring.segments import (
     without_offsets,
 )
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE
-from coordinator.recording.journal import since_joined
+from coordinator.recording.journal import JournalEvent, since_joined
 from coordinator.synchronisation.motion_windows import (
     INDEPENDENT_FRACTION,
     RATE_HZ,
@@ -88,8 +87,6 @@ ALONE_FACTOR = 2.5
 # Nor how its bodies give way to each other: in lives of two hours links and friction of twelve arms of three
 # joints were as known, and those of ten arms of six joints were wrong up to a hundred times the threshold.
 _ALONE_JOINTS = 3
-# A joint moves in a stretch if it is faster than that in it.
-_MOVES_RAD_S = 0.1
 # Standard deviation of a catalogued body, per `parameter_scale` about its centre of mass: what brackets,
 # cables and a tool add.
 BODY_SIGMA_KG = 0.1
@@ -171,7 +168,7 @@ def build_reference(known: BaselineRobot) -> Reference:
         why = "; ".join(known.kinematics.suspicions)
         raise UnsuitableBaseline(f"{known.folder} does not tell the robot's inertia: {why}")
     types = tuple(recording.module_type(serial) for serial in chain.serials)
-    motions, block = _well_known(known)
+    motions, block = steps_of_run(known)
     phi, offset_nm = fitted_torques(chain, types, joined_motions(motions))
     block = without_offsets(block, offset_nm)
     segments = Segmenter().add(block)
@@ -180,12 +177,12 @@ def build_reference(known: BaselineRobot) -> Reference:
             f"{known.folder} lasts {SEGMENT_S * len(segments):.0f} s: too short to tell what is normal; "
             f"at least {SEGMENT_S * MIN_WINDOWS * WINDOW:.0f} s are needed"
         )
-    together = moved_together([one.qd_rad_s for one in motions])
+    together = moved_together(recording.motions("dynamic"), len(types))
     factor = 1.0 if together else ALONE_FACTOR
     sigma, information, torque = _torque(chain, phi, segments)
     model = _imu_model(known, segments)
-    drives = [_drive(kind, segments, joint) for joint, kind in enumerate(types)]
     compared = together or len(types) <= _ALONE_JOINTS
+    drives = [_drive(kind, segments, joint, compared) for joint, kind in enumerate(types)]
     outside = MomentumObserver(chain, phi).advance(block.q_rad, block.qd_rad_s, block.tau_nm)
     return Reference(
         name=known.name,
@@ -199,23 +196,24 @@ def build_reference(known: BaselineRobot) -> Reference:
         imu_model=model,
         imu=_imu_test(model, segments) if compared else None,
         drive_models=tuple(drive for drive, _ in drives),
-        drives=tuple(test if compared else None for _, test in drives),
+        drives=tuple(test for _, test in drives),
         contact=contact_model(factor * FastPart().advance(outside)),
         together=together,
     )
 
 
-def _well_known(known: BaselineRobot) -> tuple[list[JointMotion], Block]:
+def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], Block]:
     """Return the motions for inertia, and all samples from the run's first step to its last.
 
-    Before and after these the motors may be off, and the robot may lie on whatever is there.
+    Before and after these the motors may be off, and the robot may lie on whatever is there. Of a run that
+    was resumed, what lies between is part of it.
 
     Raises:
         UnsuitableBaseline: something of it was not recorded.
     """
     recording, clocks, serials = known.recording, known.kinematics.clocks, known.chain.serials
     try:
-        windows = dynamic_windows(recording, clocks, serials, "dynamic")
+        motions = [filtered_window(w) for w in dynamic_windows(recording, clocks, serials, "dynamic")]
     except DataError as error:
         raise UnsuitableBaseline(f"{known.folder}: {error}") from error
     aligned = Alignment(serials).advance(recording, clocks)
@@ -224,19 +222,19 @@ def _well_known(known: BaselineRobot) -> tuple[list[JointMotion], Block]:
         raise UnsuitableBaseline(f"{known.folder}: its recording has a hole in the rows of {lost}")
     steps = [e.t_ns for e in since_joined(recording.journal) if e.what in ("begin", "motion", "done")]
     begin, end = np.searchsorted(aligned.block.t_ns, [min(steps), max(steps)])
-    return [filtered_window(one) for one in windows], part_of(aligned.block, int(begin), int(end))
+    return motions, part_of(aligned.block, int(begin), int(end))
 
 
-def moved_together(motions: Sequence[Array]) -> bool:
-    """Return whether half of the joints, two at least, moved at once in half of the time that any moved.
+def moved_together(motions: Sequence[JournalEvent], joints: int) -> bool:
+    """Return whether half of the joints, two at least, moved at once in half of the steps.
 
-    motions: their speeds [rad/s], (m, n) each. A single joint always did.
+    motions: those for inertia; joints that move at once share their step. A single joint always does.
     """
-    joints = motions[0].shape[1]
-    parts = [one[k : k + SEGMENT_SAMPLES] for one in motions for k in range(0, len(one), SEGMENT_SAMPLES)]
-    moving = np.array([np.count_nonzero(np.abs(one).max(axis=0) > _MOVES_RAD_S) for one in parts])
-    several = np.count_nonzero(moving >= max(2, -(-joints // 2)))
-    return bool(joints == 1 or several >= 0.5 * np.count_nonzero(moving))
+    steps = {event.step: set[str]() for event in motions}
+    for event in motions:
+        steps[event.step].add(event.serial)
+    several = sum(len(serials) >= max(2, -(-joints // 2)) for serials in steps.values())
+    return joints == 1 or 2 * several >= len(steps)
 
 
 def fitted_torques(chain: Chain, types: Sequence[ModuleType], motion: JointMotion) -> tuple[Array, Array]:
@@ -327,7 +325,7 @@ def _imu_test(model: ImuModel, segments: Sequence[DataSegment]) -> BaselineTest:
 
 
 def _drive(
-    kind: ModuleType, segments: Sequence[DataSegment], joint: int
+    kind: ModuleType, segments: Sequence[DataSegment], joint: int, compared: bool
 ) -> tuple[DriveModel, BaselineTest | None]:
     parts = [drive_rows(kind, one, joint) for one in segments]
     rows, torque = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -338,6 +336,8 @@ def _drive(
         sigma, counted = noise_level([(torque - rows @ theta)[:, None]])
         noise = float(max(sigma[0], 1e-6) * np.sqrt(counted[0]))
     model = DriveModel(kind, theta, noise)
+    if not compared:
+        return model, None
     windows = [
         [e for one in window if (e := drive_evidence(model, one, joint)) is not None]
         for window in _windows(segments)

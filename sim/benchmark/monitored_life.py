@@ -1,9 +1,9 @@
 """A stretch of a robot's life that the monitor attends to, and what it said of it.
 
-The robot is one that a whole run has identified, with the plan that users have by default; the monitor is the
-one that `x5-coordinator monitor` runs, with its defaults, but that it looks every half second, which is how
-long the stretches are that its tests look at. A robot whose seed is a number is the same in all of its lives,
-which differ in their day: noise, drift, weather and motions.
+The robot is one that a whole run has identified, with the plan that users have by default but for the
+excitation of the inertia; the monitor is the one that `x5-coordinator monitor` runs, with its defaults, but
+that it looks every half second, which is how long the stretches are that its tests look at. A robot whose
+seed is a number is the same in all of its lives, which differ in their day: noise, drift, weather, motions.
 """
 
 import time

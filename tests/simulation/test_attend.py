@@ -33,7 +33,7 @@ def test_without_leave_to_move_it_says_what_was_put_on_and_what_left(known_arm: 
 def test_what_the_run_leaves_open_is_said(
     known_arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda motions: False)
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda *_: False)
     scene = Scene(known_arm, tmp_path / "arm")
     scene.plays(4.0)
     assert scene.ears.heard("hardly moved its joints together")

@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
+from coordinator.baseline.baseline_robot import BaselineRobot
+from coordinator.monitoring.diagnosis import LoadShift, unexplained
 from coordinator.monitoring.findings import Kind
-from coordinator.monitoring.reference import ALONE_FACTOR
+from coordinator.monitoring.reference import (
+    ALONE_FACTOR,
+    Reference,
+    build_reference,
+    steps_of_run,
+    thresholds,
+)
+from coordinator.monitoring.segments import Alignment
 from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, known_robot_of, monitored_life
 from sim.benchmark.slow_change import ChangeKind
 from sim.imperfections.module_errors import draw_sensor_errors
@@ -69,7 +78,7 @@ def test_a_run_of_one_joint_at_a_time_is_compared_more_coarsely_and_says_so(
 ) -> None:
     known = PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True
     together = known_robot_of(*known).reference
-    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda motions: False)
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda *_: False)
     alone = known_robot_of.__wrapped__(*known).reference
     assert together.remarks == ()
     assert "hardly moved its joints together" in alone.remarks[0]
@@ -82,19 +91,40 @@ def test_a_run_of_one_joint_at_a_time_is_compared_more_coarsely_and_says_so(
 def test_of_a_long_arm_that_moved_one_joint_at_a_time_only_torques_are_compared(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda motions: False)
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda *_: False)
     monkeypatch.setattr("coordinator.monitoring.reference._ALONE_JOINTS", 2)
     known = known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True)
     assert known.reference.imu is None
     assert known.reference.drives == (None, None, None)
     assert "neither links, IMUs nor friction are monitored" in known.reference.remarks[0]
     monkeypatch.setattr("sim.benchmark.monitored_life.known_robot_of", lambda *_: known)
-    changes: tuple[ChangeKind, ...] = ("friction", "link")
-    stiff, displaced = (
-        monitored_life(PLAN._replace(change=kind, for_s=45.0, from_s=12.0, over_s=10.0)) for kind in changes
-    )
+    stiff = monitored_life(PLAN._replace(change="friction", for_s=45.0, from_s=12.0, over_s=10.0))
     assert not stiff.said
-    assert not {one.kind for one in displaced.said} & {"wear", "gyro", "accelerometer"}
+    # What nothing else tells may be a link.
+    limits, load = thresholds(known.reference), LoadShift(2, 50.0, 50.0, np.zeros(10), None)
+    assert "a link is displaced" in unexplained(known.reference, limits, load).summary
+
+
+def test_a_robot_is_known_from_what_it_did_in_the_steps_of_its_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before and after them it may have been limp, and pushed by what it lay on."""
+    baselines: list[BaselineRobot] = []
+
+    def keep(known: BaselineRobot) -> Reference:
+        baselines.append(known)
+        return build_reference(known)
+
+    monkeypatch.setattr("sim.benchmark.monitored_life.build_reference", keep)
+    known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True)
+    recording, clocks = baselines[0].recording, baselines[0].kinematics.clocks
+    whole = Alignment(baselines[0].chain.serials).advance(recording, clocks).block
+    motions, block = steps_of_run(baselines[0])
+    assert whole is not None
+    steps = [event.t_ns for event in recording.journal if event.step]
+    assert whole.t_ns[0] < steps[0] - 1e9
+    assert steps[0] <= block.t_ns[0] < steps[0] + 4e6
+    assert block.t_ns[-1] < steps[-1]
+    dynamic = recording.motions("dynamic")
+    assert len(motions) == len({event.step for event in dynamic})
 
 
 def test_torque_sensors_offsets_are_known_from_the_run_and_taken_off(monkeypatch: pytest.MonkeyPatch) -> None:

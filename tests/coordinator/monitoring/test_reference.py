@@ -6,6 +6,7 @@ import pytest
 from coordinator.monitoring.reference import fitted_torques, moved_together
 from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.least_squares import solve_weighted
+from coordinator.recording.journal import JournalEvent
 from coordinator.synchronisation.motion_windows import joined_motions
 from module_agent.model.chain import Array
 from module_agent.model.information import gather
@@ -13,30 +14,32 @@ from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
 from tests.coordinator.monitoring.moving_arm import CHAIN, JOINTS, KINDS, PHI, segments
 
-STILL = np.full((125, 2), 0.01)
-FIRST, SECOND = (
-    STILL + np.array(column) * np.sin(np.arange(125) / 20.0)[:, None] for column in ([1, 0], [0, 1])
-)
+
+def _motions(*steps: str) -> list[JournalEvent]:
+    """Return the motions of steps, each given by the letters of its joints."""
+    return [
+        JournalEvent(t_ns=0, what="motion", step=f"dynamic/{k}", serial=serial, purpose="dynamic")
+        for k, serials in enumerate(steps)
+        for serial in serials
+    ]
 
 
 def test_joints_that_move_one_after_the_other_do_not_move_together() -> None:
-    assert not moved_together([STILL, FIRST, STILL, SECOND])
+    assert not moved_together(_motions("A", "B"), 2)
 
 
-def test_joints_that_move_at_once_half_of_the_time_that_any_moves_move_together() -> None:
-    both = FIRST + SECOND
-    assert moved_together([*[STILL] * 9, both, np.concatenate([FIRST, both, STILL, SECOND, both])])
-    assert not moved_together([FIRST, both, SECOND])
+def test_joints_that_move_at_once_in_half_of_the_motions_move_together() -> None:
+    assert moved_together(_motions("A", "AB"), 2)
+    assert not moved_together(_motions("A", "AB", "B"), 2)
 
 
 def test_two_of_six_joints_that_move_at_once_do_not_show_how_all_of_them_move() -> None:
-    two = np.hstack([FIRST + SECOND, STILL, STILL])
-    assert not moved_together([two])
-    assert moved_together([np.hstack([FIRST + SECOND, FIRST, STILL])])
+    assert not moved_together(_motions("AB", "CD", "EF"), 6)
+    assert moved_together(_motions("ABC", "DEF"), 6)
 
 
 def test_a_single_joint_has_none_to_move_with() -> None:
-    assert moved_together([FIRST[:, :1]])
+    assert moved_together(_motions("A"), 1)
 
 
 # What sensors of the first joint, which carries all, and of the last read of nothing [Nm].
