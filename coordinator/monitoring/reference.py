@@ -1,8 +1,8 @@
 """What a robot was when it was well, with all that the watch needs: models, noise, thresholds.
 
-All but priors comes from the recording of one run. The run is looked at as the watch looks
-at a robot: in stretches of half a second, whatever was moving. What the tests find in one part of it against
-all the rest is what they find in a robot that has not changed; by that their noise is inflated.
+Everything but the priors comes from the recording of one run. The run is looked at as the watch looks at a
+robot: in stretches of half a second, whatever was moving. What the tests find in one part of it against all
+the rest is what they find in a robot that has not changed; by that their noise is inflated.
 """
 
 from collections.abc import Sequence

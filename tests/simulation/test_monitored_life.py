@@ -6,6 +6,7 @@ import pytest
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.monitoring.diagnosis import LoadShift, unexplained
 from coordinator.monitoring.findings import Kind
+from coordinator.monitoring.monitor import Monitor
 from coordinator.monitoring.reference import (
     ALONE_FACTOR,
     Reference,
@@ -14,7 +15,14 @@ from coordinator.monitoring.reference import (
     thresholds,
 )
 from coordinator.monitoring.segments import Alignment
-from sim.benchmark.monitored_life import Life, LifePlan, false_alarms, known_robot_of, monitored_life
+from sim.benchmark.monitored_life import (
+    KnownRobot,
+    Life,
+    LifePlan,
+    false_alarms,
+    known_robot_of,
+    monitored_life,
+)
 from sim.benchmark.slow_change import ChangeKind
 from sim.imperfections.module_errors import draw_sensor_errors
 from sim.imperfections.noise_profile import noise_profile
@@ -105,19 +113,29 @@ def test_of_a_long_arm_that_moved_one_joint_at_a_time_only_torques_are_compared(
     assert "a link is displaced" in unexplained(known.reference, limits, load).summary
 
 
-def test_a_robot_is_known_from_what_it_did_in_the_steps_of_its_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before and after them it may have been limp, and pushed by what it lay on."""
+@pytest.fixture(scope="module")
+def uncalibrated() -> tuple[BaselineRobot, KnownRobot]:
+    """A run of a robot whose torque sensors have offsets, and what is known from it."""
     baselines: list[BaselineRobot] = []
 
     def keep(known: BaselineRobot) -> Reference:
         baselines.append(known)
         return build_reference(known)
 
-    monkeypatch.setattr("sim.benchmark.monitored_life.build_reference", keep)
-    known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, PLAN.noise, PLAN.excitation, True)
-    recording, clocks = baselines[0].recording, baselines[0].kinematics.clocks
-    whole = Alignment(baselines[0].chain.serials).advance(recording, clocks).block
-    motions, block = steps_of_run(baselines[0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sim.benchmark.monitored_life.build_reference", keep)
+        known = known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, "x5-uncalibrated", PLAN.excitation, True)
+    return baselines[0], known
+
+
+def test_a_robot_is_known_from_what_it_did_in_the_steps_of_its_run(
+    uncalibrated: tuple[BaselineRobot, KnownRobot],
+) -> None:
+    """Before and after them it may have been limp, and pushed by what it lay on."""
+    baseline, _ = uncalibrated
+    recording, clocks = baseline.recording, baseline.kinematics.clocks
+    whole = Alignment(baseline.chain.serials).advance(recording, clocks).block
+    motions, block = steps_of_run(baseline)
     assert whole is not None
     steps = [event.t_ns for event in recording.journal if event.step]
     assert whole.t_ns[0] < steps[0] - 1e9
@@ -127,8 +145,10 @@ def test_a_robot_is_known_from_what_it_did_in_the_steps_of_its_run(monkeypatch: 
     assert len(motions) == len({event.step for event in dynamic})
 
 
-def test_torque_sensors_offsets_are_known_from_the_run_and_taken_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = known_robot_of.__wrapped__(PLAN.robot, PLAN.seed, "x5-uncalibrated", PLAN.excitation, True)
+def test_torque_sensors_offsets_are_known_from_the_run_and_taken_off(
+    uncalibrated: tuple[BaselineRobot, KnownRobot],
+) -> None:
+    baseline, known = uncalibrated
     reference, serials = known.reference, known.robot.serials
     types = [reference.types[reference.chain.serials.index(serial)] for serial in serials]
     errors = draw_sensor_errors(PLAN.seed, serials, types, noise_profile("x5-uncalibrated"))
@@ -136,9 +156,12 @@ def test_torque_sensors_offsets_are_known_from_the_run_and_taken_off(monkeypatch
     off_nm = np.array([truth[serial] for serial in reference.chain.serials]) - reference.torque_offset_nm
     # Of the second joint, which bears the arm, weight and offset are told apart less well.
     np.testing.assert_array_less(np.abs(off_nm), [5e-3, 0.03, 5e-3])
-    # The control: what a monitor takes off that is no offset, it reports.
-    wrong = reference._replace(torque_offset_nm=reference.torque_offset_nm + np.array([0.0, 0.0, 1.0]))
-    monkeypatch.setattr(
-        "sim.benchmark.monitored_life.known_robot_of", lambda *_: known._replace(reference=wrong)
-    )
-    assert monitored_life(PLAN._replace(noise="x5-uncalibrated")).said
+    # What a monitor takes off of the torques acts from outside for it; its low-pass has settled long before.
+    further_nm = np.array([0.5, -0.25, 1.0])
+    felt = []
+    for offset_nm in (reference.torque_offset_nm, reference.torque_offset_nm + further_nm):
+        monitor = Monitor(reference._replace(torque_offset_nm=offset_nm))
+        monitor.advance(baseline.recording, baseline.kinematics.clocks)
+        assert monitor.outside_nm is not None
+        felt.append(monitor.outside_nm)
+    np.testing.assert_allclose(felt[1] - felt[0], further_nm, atol=1e-6)
