@@ -11,12 +11,14 @@ What motor currents say of a drive's friction: the motor's torque against the sp
 A motor that turns at w (seen at the output) with current i, behind a gear of ratio N that passes on a share
 eta of what drives and all of what is driven back, has
 
-    m = k N i (eta or 1) = c tau + l sign(w) |tau| + Fc sign(w) + Fv w + J w' + offset,
+    m = k N i (eta or 1) = c tau + l sign(w) |tau| + Fc sign(w) + Fv w + J w' + T tau' + offset,
 
-tau the spring's torque, c and l what motor constant and losses are off their type's (1 and 0; Khalil and
-Dombre 2002, section 9.6, for the rest). The motor's side stands alone on the left, as a joint that carries
-nothing would else be explained best by no motor at all. Only where the motor turns is friction what it seems,
-so that slow samples do not count.
+tau the spring's torque as read, c and l what motor constant and losses are off their type's (1 and 0; Khalil
+and Dombre 2002, section 9.6, for the rest), T by what the reading lags behind what the spring transmits (its
+own damping; `torque_terms`): as tau' of a quick motion goes against its speed, less friction would else
+explain it. The motor's side stands alone on the left, as a joint that carries nothing would else be explained
+best by no motor at all. Only where the motor turns is friction what it seems, so that slow samples do not
+count.
 """
 
 from collections.abc import Sequence
@@ -230,8 +232,8 @@ def _thinned(segment: DataSegment) -> DataSegment:
     return DataSegment(segment.raw, segment.t_ns[::KEEP_EVERY], *thin)
 
 
-# c, l, Fc, Fv, J, offset: Fc and Fv are what changes.
-TERMS = 6
+# c, l, Fc, Fv, J, T, offset: Fc and Fv are what changes.
+TERMS = 7
 _FRICTION = slice(2, 4)
 # Of the largest speed; below, a motor may stick within its tick.
 SLOW_SHARE = 0.04
@@ -240,10 +242,12 @@ REACH_SAMPLES = 10
 MIN_SAMPLES = 20
 # Of c and l: what a joint that carries little tells of them is not what they are under another load.
 OWN_SIGMA = np.array([0.1, 0.1])
+# By which the readings of springs lag: rubber damps, of steel there is nothing to be seen.
+_LAG_SIGMA_S = 5e-3
 
 
 class DriveModel(NamedTuple):
-    """A joint's drive: its parameters (6,), and its scatter [Nm] as if samples were independent."""
+    """A joint's drive: its parameters (7,), and its scatter [Nm] as if samples were independent."""
 
     kind: ModuleType
     theta: Array
@@ -251,10 +255,10 @@ class DriveModel(NamedTuple):
 
     @property
     def prior_sigma(self) -> Array:
-        """How far its parameters may be from where they are (6,): gears and motors of a type are alike."""
+        """How far its parameters may be from where they are (7,): gears and motors of a type are alike."""
         usual = catalogued_drive(self.kind)
         friction = np.maximum(usual[_FRICTION], 0.01) * 2.0
-        return np.array([0.05, 0.1, *friction, usual[4], 0.05 * self.kind.max_effort_nm])
+        return np.array([0.05, 0.1, *friction, usual[4], _LAG_SIGMA_S, 0.05 * self.kind.max_effort_nm])
 
     @property
     def change(self) -> Array:
@@ -280,7 +284,7 @@ class DriveModel(NamedTuple):
 
 
 def drive_rows(kind: ModuleType, segment: DataSegment, joint: int) -> tuple[Array, Array]:
-    """Return the rows (k, 6) and motor torques (k,) [Nm] of the samples in which the motor of a joint turns.
+    """Return the rows (k, 7) and motor torques (k,) [Nm] of the samples in which the motor of a joint turns.
 
     All signals went through the same low-pass, which reaches into what is around a sample.
     """
@@ -291,14 +295,15 @@ def drive_rows(kind: ModuleType, segment: DataSegment, joint: int) -> tuple[Arra
     per_amp = kind.gear_ratio * kind.motor.back_emf_v_s_rad
     motor = per_amp * (kind.motor.efficiency * driving + driven)
     speeds = turned / kind.gear_ratio, change / kind.gear_ratio
-    rows = np.column_stack([segment.tau_nm[:, joint], loss, sign, *speeds, np.ones_like(sign)])
+    tau, rate = segment.tau_nm[:, joint], segment.tau_rate_nm_s[:, joint]
+    rows = np.column_stack([tau, loss, sign, *speeds, rate, np.ones_like(sign)])
     return rows[turning], motor[turning]
 
 
 def drive_evidence(model: DriveModel, segment: DataSegment, joint: int) -> Evidence | None:
     """Return the evidence about the drive's deviation from its model; None if the motor stood.
 
-    Before the six parameters are those of how torque is passed on, the stretch's own (2,): see `OWN_SIGMA`.
+    Before the seven parameters are those of how torque is passed on, the stretch's own (2,): see `OWN_SIGMA`.
     """
     rows, torque = drive_rows(model.kind, segment, joint)
     if len(rows) < MIN_SAMPLES:
@@ -308,12 +313,12 @@ def drive_evidence(model: DriveModel, segment: DataSegment, joint: int) -> Evide
 
 
 def drive_window(parts: Sequence[Evidence]) -> Evidence:
-    """Return the evidence about the six parameters of a window's stretches together."""
+    """Return the evidence about the seven parameters of a window's stretches together."""
     return without_own(joined(parts), OWN_SIGMA)
 
 
 def fitted_drive(kind: ModuleType, rows: Array, torque_nm: Array) -> Array:
-    """Return the parameters (6,) that explain a drive's torques best.
+    """Return the parameters (7,) that explain a drive's torques best.
 
     A drive that hardly moved keeps what its type's catalogue says, as far as the samples leave it open.
     """
@@ -326,7 +331,7 @@ def fitted_drive(kind: ModuleType, rows: Array, torque_nm: Array) -> Array:
 
 
 def catalogued_drive(kind: ModuleType) -> Array:
-    """Return a drive's parameters (6,) by its type."""
+    """Return a drive's parameters (7,) by its type."""
     motor = kind.motor
     inertia = motor.rotor_inertia_kg_m2 * kind.gear_ratio**2
-    return np.array([1.0, 0.0, motor.coulomb_nm, motor.viscous_nm_s_rad, inertia, 0.0])
+    return np.array([1.0, 0.0, motor.coulomb_nm, motor.viscous_nm_s_rad, inertia, 0.0, 0.0])

@@ -207,9 +207,9 @@ _EDGE = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ)
 class DataSegment(NamedTuple):
     """m samples of n modules; all but `raw`, the same samples, went through the same low-pass.
 
-    t_ns: (m,). q_rad, qd_rad_s, qdd_rad_s2, tau_nm: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3), and how fast
-    both change, (m, n, 6). drive: (m, n, 6) currents of motors that drive, of motors that are driven back,
-    sign(w) |tau|, sign(w), w and w' with w the motor's speed.
+    t_ns: (m,). q_rad, qd_rad_s, qdd_rad_s2, tau_nm, and how fast that changes: (m, n). gyro_rad_s,
+    accel_m_s2: (m, n, 3), and how fast both change, (m, n, 6). drive: (m, n, 6) currents of motors that
+    drive, of motors that are driven back, sign(w) |tau|, sign(w), w and w' with w the motor's speed.
     """
 
     raw: Block
@@ -218,6 +218,7 @@ class DataSegment(NamedTuple):
     qd_rad_s: Array
     qdd_rad_s2: Array
     tau_nm: Array
+    tau_rate_nm_s: Array
     gyro_rad_s: Array
     accel_m_s2: Array
     imu_rates: Array
@@ -256,6 +257,7 @@ def _segment(block: Block) -> DataSegment:
         qd_rad_s=qd[kept],
         qdd_rad_s2=qdd[kept],
         tau_nm=tau[kept],
+        tau_rate_nm_s=differentiate(tau, RATE_HZ)[kept],
         gyro_rad_s=gyro[kept],
         accel_m_s2=accel[kept],
         imu_rates=rates[kept],

@@ -57,15 +57,15 @@ def _segment(rng: Generator) -> DataSegment:
     drive = np.concatenate([drive, (qdd * motor / np.where(qd, qd, 1.0))[..., None]], axis=2)
     raw = Block(np.arange(125), q, qd, tau, motor, drive[..., 0], gyro, accel)
     noisy = tau + TORQUE_SIGMA * rng.normal(size=tau.shape)
-    rates = np.zeros((125, JOINTS, 6))
-    return DataSegment(raw, raw.t_ns, q, qd, qdd, noisy, gyro, accel, rates, drive)
+    rates, tau_rate = np.zeros((125, JOINTS, 6)), np.gradient(tau, 0.004, axis=0)
+    return DataSegment(raw, raw.t_ns, q, qd, qdd, noisy, tau_rate, gyro, accel, rates, drive)
 
 
 def _current(tau: Array, qd: Array, qdd: Array) -> Array:
     """Return the currents with which the catalogue's motors drive these joints."""
     columns = []
     for joint, kind in enumerate(KINDS):
-        c, _, coulomb, viscous, inertia, _ = catalogued_drive(kind)
+        c, _, coulomb, viscous, inertia, *_ = catalogued_drive(kind)
         torque = c * tau[:, joint] + coulomb * np.sign(qd[:, joint]) + viscous * qd[:, joint]
         torque += inertia * qdd[:, joint]
         columns.append(torque / (kind.gear_ratio * kind.motor.back_emf_v_s_rad * kind.motor.efficiency))
