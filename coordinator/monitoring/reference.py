@@ -53,7 +53,6 @@ from coordinator.monitoring.segments import (
     DataSegment,
     Segmenter,
     noise_level,
-    part_of,
     without_offsets,
 )
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE
@@ -168,10 +167,10 @@ def build_reference(known: BaselineRobot) -> Reference:
         why = "; ".join(known.kinematics.suspicions)
         raise UnsuitableBaseline(f"{known.folder} does not tell the robot's inertia: {why}")
     types = tuple(recording.module_type(serial) for serial in chain.serials)
-    motions, block = steps_of_run(known)
+    motions, blocks = steps_of_run(known)
     phi, offset_nm = fitted_torques(chain, types, joined_motions(motions))
-    block = without_offsets(block, offset_nm)
-    segments = Segmenter().add(block)
+    blocks = [without_offsets(block, offset_nm) for block in blocks]
+    segments = [segment for block in blocks for segment in Segmenter().add(block)]
     if len(segments) < MIN_WINDOWS * WINDOW:
         raise UnsuitableBaseline(
             f"{known.folder} lasts {SEGMENT_S * len(segments):.0f} s: too short to tell what is normal; "
@@ -183,7 +182,8 @@ def build_reference(known: BaselineRobot) -> Reference:
     model = _imu_model(known, segments)
     compared = together or len(types) <= _ALONE_JOINTS
     drives = [_drive(kind, segments, joint, compared) for joint, kind in enumerate(types)]
-    outside = MomentumObserver(chain, phi).advance(block.q_rad, block.qd_rad_s, block.tau_nm)
+    outside = [MomentumObserver(chain, phi).advance(b.q_rad, b.qd_rad_s, b.tau_nm) for b in blocks]
+    fast = np.concatenate([FastPart().advance(one) for one in outside])
     return Reference(
         name=known.name,
         chain=chain,
@@ -197,16 +197,15 @@ def build_reference(known: BaselineRobot) -> Reference:
         imu=_imu_test(model, segments) if compared else None,
         drive_models=tuple(drive for drive, _ in drives),
         drives=tuple(test for _, test in drives),
-        contact=contact_model(factor * FastPart().advance(outside)),
+        contact=contact_model(factor * fast),
         together=together,
     )
 
 
-def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], Block]:
-    """Return the motions for inertia, and all samples from the run's first step to its last.
+def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], list[Block]]:
+    """Return the motions for inertia, and per session of the run all samples from its first step to its last.
 
-    Before and after these the motors may be off, and the robot may lie on whatever is there. Of a run that
-    was resumed, what lies between is part of it.
+    Before, between and after these the motors may be off, and the robot may lie on whatever is there.
 
     Raises:
         UnsuitableBaseline: something of it was not recorded.
@@ -216,13 +215,28 @@ def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], Block]:
         motions = [filtered_window(w) for w in dynamic_windows(recording, clocks, serials, "dynamic")]
     except DataError as error:
         raise UnsuitableBaseline(f"{known.folder}: {error}") from error
-    aligned = Alignment(serials).advance(recording, clocks)
-    if aligned.block is None:
-        lost = ", ".join(f"module {h.serial}" for h in aligned.gaps) or "a module"
-        raise UnsuitableBaseline(f"{known.folder}: its recording has a hole in the rows of {lost}")
-    steps = [e.t_ns for e in since_joined(recording.journal) if e.what in ("begin", "motion", "done")]
-    begin, end = np.searchsorted(aligned.block.t_ns, [min(steps), max(steps)])
-    return motions, part_of(aligned.block, int(begin), int(end))
+    blocks = []
+    for begin_ns, end_ns in _spans(since_joined(recording.journal)):
+        aligned = Alignment(serials, begin_ns).advance(recording, clocks, end_ns)
+        if aligned.gaps:
+            lost = ", ".join(f"module {gap.serial}" for gap in aligned.gaps)
+            raise UnsuitableBaseline(f"{known.folder}: its recording has a hole in the rows of {lost}")
+        if aligned.block is not None:
+            blocks.append(aligned.block)
+    if not blocks:
+        raise UnsuitableBaseline(f"{known.folder}: no rows of all modules were recorded in its steps")
+    return motions, blocks
+
+
+def _spans(journal: Sequence[JournalEvent]) -> list[tuple[int, int]]:
+    """Return the session times of the first and the last step of every session that has any."""
+    sessions: list[list[int]] = [[]]
+    for event in journal:
+        if event.what == "session":
+            sessions.append([])
+        elif event.what in ("begin", "motion", "done"):
+            sessions[-1].append(event.t_ns)
+    return [(min(times), max(times)) for times in sessions if times]
 
 
 def moved_together(motions: Sequence[JournalEvent], joints: int) -> bool:

@@ -76,14 +76,19 @@ class _Track(NamedTuple):
 
 
 class Alignment:
-    """Turns a recording that grows into blocks, each beginning where the last one ended."""
+    """Turns a recording that grows into blocks, each beginning where the last one ended.
 
-    def __init__(self, serials: Sequence[str]):
-        self._serials = tuple(serials)
+    The first one begins at `from_ns` of session time, or as soon as all modules have rows.
+    """
+
+    def __init__(self, serials: Sequence[str], from_ns: int = 0):
+        self._serials, self._from_ns = tuple(serials), from_ns
         self._next_ns: int | None = None
 
-    def advance(self, recording: Recording, clocks: Mapping[str, ClockMap]) -> Aligned:
-        """Return the samples that all modules have since the last call."""
+    def advance(
+        self, recording: Recording, clocks: Mapping[str, ClockMap], until_ns: int | None = None
+    ) -> Aligned:
+        """Return the samples that all modules have since the last call, before a session time if given."""
         spans = [self._span(recording, clocks, s) for s in self._serials]
         known = [span for span in spans if span is not None]
         if len(known) < len(spans):
@@ -95,8 +100,10 @@ class Alignment:
             s for s, (_, last) in zip(self._serials, known, strict=True) if newest - last > SILENT_NS
         )
         if self._next_ns is None:
-            self._next_ns = _on_grid(max(first for first, _ in known))
+            self._next_ns = _on_grid(max(self._from_ns, *(first for first, _ in known)))
         end = min(last for _, last in known)
+        if until_ns is not None:
+            end = min(end, until_ns + MAX_GAP_NS)
         tracks = [_track(recording, clocks[s], s, self._next_ns, end) for s in self._serials]
         gaps = tuple(
             gap
@@ -112,7 +119,8 @@ class Alignment:
             return Aligned(None, (), silent)
         # Two rows beyond the last sample are needed for the cubic.
         ends = [int(t[-2]) for track in whole for t in (track.t_ns, track.imu_t_ns)]
-        grid = np.arange(self._next_ns, min(ends), STEP_NS, dtype=np.int64)
+        stop = min(ends) if until_ns is None else min(*ends, until_ns)
+        grid = np.arange(self._next_ns, stop, STEP_NS, dtype=np.int64)
         if not grid.size:
             return Aligned(None, (), silent)
         self._next_ns = int(grid[-1]) + STEP_NS

@@ -9,9 +9,11 @@ from typing import Any, get_args
 
 import pytest
 
+from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, UnfitLink
 from coordinator.live_robot.messenger import NoAnswer
+from coordinator.monitoring.reference import build_reference, steps_of_run
 from coordinator.recording.recording import Entry
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import NotRecorded, SessionWriter
@@ -230,6 +232,33 @@ def test_a_run_whose_coordinator_is_killed_is_resumed_and_ends_right(
     assert [s for s in done if s != "home"] == list(dict.fromkeys(s for s in done if s != "home"))
     assert not (out / "session.crashed.mcap").exists()
     assert json.loads((out / "result.json").read_text())["serials"] == [BASE, TIP]
+
+
+@pytest.mark.parametrize(
+    "break_s", [pytest.param(1.0, id="at once"), pytest.param(90.0, id="when its rows are forgotten")]
+)
+def test_a_resumed_run_says_what_is_normal_by_the_steps_of_its_sessions(
+    rigs: Rigs, tmp_path: Path, break_s: float
+) -> None:
+    """Between them the arm hangs limp; modules remember a minute of that, and of more there is a hole."""
+    rig = rigs("a2085_03", "lan", 3)
+    out = tmp_path / "run"
+    plan = Plan(mode="simultaneous", excitation="d-optimal", excitation_motions=4, excitation_s=4.0)
+    _crash(rig, out, plan, lambda: rig.loop.now_ns >= 28.0 * NS_PER_S)
+    rig.loop.call_later(break_s, rig.loop.stop)
+    rig.loop.run_forever()
+    again_ns = rig.loop.now_ns
+    rig.session(out, plan, resume=True, sender="successor")
+
+    known = load_baseline(out)
+    motions, (before, after) = steps_of_run(known)
+    assert len(motions) == 4
+    begun = {e.step: e.t_ns for e in known.recording.journal if e.what == "begin"}
+    # The motion in which the coordinator died is made again.
+    assert before.t_ns[-1] < 28.0 * NS_PER_S
+    assert after.t_ns[0] > again_ns
+    assert before.t_ns[-1] < begun["dynamic/1"] < after.t_ns[-1]
+    assert build_reference(known).together
 
 
 class _FullDisk(SessionWriter):

@@ -135,7 +135,7 @@ def test_a_robot_is_known_from_what_it_did_in_the_steps_of_its_run(
     baseline, _ = uncalibrated
     recording, clocks = baseline.recording, baseline.kinematics.clocks
     whole = Alignment(baseline.chain.serials).advance(recording, clocks).block
-    motions, block = steps_of_run(baseline)
+    motions, [block] = steps_of_run(baseline)
     assert whole is not None
     steps = [event.t_ns for event in recording.journal if event.step]
     assert whole.t_ns[0] < steps[0] - 1e9
