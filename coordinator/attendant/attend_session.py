@@ -116,9 +116,11 @@ class AttendSession:
         self._say(f"attends {known.name}, version {self._versions.current_number}: {', '.join(serials)}")
         while (wanted := await self._watch(attendant, reference, until_ns)) is not None:
             assert self._measurer is not None, "an attendant that may not move wants no measurement"
-            outcome, known = await self._measurer.measure(wanted, known)
+            outcome, later = await self._measurer.measure(wanted, known)
             self._take(attendant.ended(self._site.clock(), wanted, outcome))
-            reference = await self._reference(known)
+            # A model that is kept leaves open what it did before.
+            if later is not known:
+                known, reference = later, await self._reference(later)
 
     async def _reference(self, known: BaselineRobot) -> Reference:
         """Return what to compare with, and say what it leaves open."""

@@ -111,9 +111,10 @@ def test_a_model_that_is_not_to_be_believed_is_no_reason_to_move_the_robot(
 
 
 def test_a_second_measurement_is_granted_the_modules_as_the_first_was(
-    known_arm: Path, tmp_path: Path
+    known_arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each begins a connection anew, and with it the numbers of its requests."""
+    monkeypatch.setattr("coordinator.monitoring.reference.moved_together", lambda *_: False)
     scene = Scene(known_arm, tmp_path / "arm", ROOM)
     scene.at(2.0, lambda: scene.robot.kill(LAST))
     scene.at(26.0, lambda: scene.robot.boot(LAST))
@@ -121,6 +122,8 @@ def test_a_second_measurement_is_granted_the_modules_as_the_first_was(
     scene.plays(190.0)
     history = [(entry.what, entry.version) for entry in scene.versions.history]
     assert history == [("failed", 2), ("replaced", 3)], scene.ears.said
+    # What a model leaves open is said once of each of the two.
+    assert len(scene.ears.heard("hardly moved its joints together")) == 2
 
 
 def test_a_module_that_comes_back_while_the_rest_is_measured_ends_that_by_name(
