@@ -7,6 +7,7 @@ rate of false alarms.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -87,13 +88,16 @@ class FastPart:
         return np.asarray(signal - slow)
 
 
-def contact_model(fast_nm: Array) -> ContactModel:
-    """Fit the model to the fast part (m, n) [Nm] of a run without contacts."""
-    settled = fast_nm[round(LASTING_S * RATE_HZ) :]
-    sigma = settled.std(axis=0)
-    upward = (settled[:-1] < 0.0) & (settled[1:] >= 0.0)
-    crossings = upward.sum(axis=0) * RATE_HZ / max(len(settled), 1)
-    return ContactModel(sigma, np.abs(settled).max(axis=0), np.maximum(crossings, 0.1))
+def contact_model(fast_nm: Sequence[Array]) -> ContactModel:
+    """Fit the model to the fast parts (m, n) [Nm] of stretches without contacts.
+
+    Each settles first; one at least is longer than that.
+    """
+    parts = [part[round(LASTING_S * RATE_HZ) :] for part in fast_nm]
+    settled = np.concatenate(parts)
+    upward = sum(((part[:-1] < 0.0) & (part[1:] >= 0.0)).sum(axis=0) for part in parts)
+    crossings = upward * RATE_HZ / max(len(settled), 1)
+    return ContactModel(settled.std(axis=0), np.abs(settled).max(axis=0), np.maximum(crossings, 0.1))
 
 
 class ContactDetector:

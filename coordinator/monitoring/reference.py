@@ -94,6 +94,10 @@ _ROUNDS = 3
 _NO_NOISE = 1e-9
 
 
+# The stretches of half a second of each session of a run.
+_Sessions = Sequence[Sequence[DataSegment]]
+
+
 class UnsuitableBaseline(UsageError):
     """The run does not hold what the watch needs; the message says what is missing."""
 
@@ -170,20 +174,20 @@ def build_reference(known: BaselineRobot) -> Reference:
     motions, blocks = steps_of_run(known)
     phi, offset_nm = fitted_torques(chain, types, joined_motions(motions))
     blocks = [without_offsets(block, offset_nm) for block in blocks]
-    segments = [segment for block in blocks for segment in Segmenter().add(block)]
-    if len(segments) < MIN_WINDOWS * WINDOW:
+    sessions = [Segmenter().add(block) for block in blocks]
+    if len(_windows(sessions)) < MIN_WINDOWS:
         raise UnsuitableBaseline(
-            f"{known.folder} lasts {SEGMENT_S * len(segments):.0f} s: too short to tell what is normal; "
-            f"at least {SEGMENT_S * MIN_WINDOWS * WINDOW:.0f} s are needed"
+            f"{known.folder} lasts {SEGMENT_S * len(_stretches(sessions)):.0f} s: too short to tell what is "
+            f"normal; at least {SEGMENT_S * MIN_WINDOWS * WINDOW:.0f} s are needed"
         )
     together = moved_together(recording.motions("dynamic"), len(types))
     factor = 1.0 if together else ALONE_FACTOR
-    sigma, information, torque = _torque(chain, phi, segments)
-    model = _imu_model(known, segments)
+    sigma, information, torque = _torque(chain, phi, sessions)
+    model = _imu_model(known, sessions)
     compared = together or len(types) <= _ALONE_JOINTS
-    drives = [_drive(kind, segments, joint, compared) for joint, kind in enumerate(types)]
+    drives = [_drive(kind, sessions, joint, compared) for joint, kind in enumerate(types)]
     outside = [MomentumObserver(chain, phi).advance(b.q_rad, b.qd_rad_s, b.tau_nm) for b in blocks]
-    fast = np.concatenate([FastPart().advance(one) for one in outside])
+    fast = [factor * FastPart().advance(one) for one in outside]
     return Reference(
         name=known.name,
         chain=chain,
@@ -194,21 +198,22 @@ def build_reference(known: BaselineRobot) -> Reference:
         information=information,
         torque=torque._replace(inflation=factor**2 * torque.inflation),
         imu_model=model,
-        imu=_imu_test(model, segments) if compared else None,
+        imu=_imu_test(model, sessions) if compared else None,
         drive_models=tuple(drive for drive, _ in drives),
         drives=tuple(test for _, test in drives),
-        contact=contact_model(factor * fast),
+        contact=contact_model(fast),
         together=together,
     )
 
 
 def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], list[Block]]:
-    """Return the motions for inertia, and per session of the run all samples from its first step to its last.
+    """Return the motions for inertia, and per session of the run its samples.
 
+    They begin with its first step and end with the last one that was done, as far as all modules have them.
     Before, between and after these the motors may be off, and the robot may lie on whatever is there.
 
     Raises:
-        UnsuitableBaseline: something of it was not recorded.
+        UnsuitableBaseline: something within them was not recorded.
     """
     recording, clocks, serials = known.recording, known.kinematics.clocks, known.chain.serials
     try:
@@ -224,19 +229,22 @@ def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], list[Block]]:
         if aligned.block is not None:
             blocks.append(aligned.block)
     if not blocks:
-        raise UnsuitableBaseline(f"{known.folder}: no rows of all modules were recorded in its steps")
+        raise UnsuitableBaseline(
+            f"{known.folder}: its steps have no time in common with the rows of all modules"
+        )
     return motions, blocks
 
 
 def _spans(journal: Sequence[JournalEvent]) -> list[tuple[int, int]]:
-    """Return the session times of the first and the last step of every session that has any."""
-    sessions: list[list[int]] = [[]]
+    """Return the session times at which the first step of every session began and its last one was done."""
+    sessions: list[list[JournalEvent]] = [[]]
     for event in journal:
         if event.what == "session":
             sessions.append([])
         elif event.what in ("begin", "motion", "done"):
-            sessions[-1].append(event.t_ns)
-    return [(min(times), max(times)) for times in sessions if times]
+            sessions[-1].append(event)
+    done = [[event.t_ns for event in events if event.what == "done"] for events in sessions]
+    return [(events[0].t_ns, max(ends)) for events, ends in zip(sessions, done, strict=True) if ends]
 
 
 def moved_together(motions: Sequence[JournalEvent], joints: int) -> bool:
@@ -307,41 +315,41 @@ def _most_probable(
 
 
 def _torque(
-    chain: Chain, phi: Array, segments: Sequence[DataSegment]
+    chain: Chain, phi: Array, sessions: _Sessions
 ) -> tuple[Array, tuple[JointInformation, ...], BaselineTest]:
-    sigma, counted = noise_level([torque_residual(chain, phi, one) for one in segments])
+    sigma, counted = noise_level([torque_residual(chain, phi, one) for one in _stretches(sessions)])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
     evidence = [
         torque_window([torque_evidence(chain, phi, independent, one) for one in window])
-        for window in _windows(segments)
+        for window in _windows(sessions)
     ]
     test = _calibrated(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
-    whole = merge(*(information_of(chain, one) for window in _windows(segments) for one in window))
+    whole = merge(*(information_of(chain, one) for window in _windows(sessions) for one in window))
     return independent, whole, test
 
 
-def _imu_model(known: BaselineRobot, segments: Sequence[DataSegment]) -> ImuModel:
+def _imu_model(known: BaselineRobot, sessions: _Sessions) -> ImuModel:
     refinement, count = known.kinematics.refinement, len(known.chain.serials)
     chain = with_placement(known.chain, refinement.placement)
     # Delays are each segment's own.
     errors = refinement.intrinsics.errors.copy()
     errors[:, DELAY] = 0.0
     rough = ImuModel(chain, ImuIntrinsics(errors), IMU_PRIORS[known.imu], np.full((count, 6), 0.05))
-    sigma, counted = noise_level(lasting_residual(rough, segments))
+    sigma, counted = noise_level(lasting_residual(rough, _stretches(sessions)))
     return rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
 
 
-def _imu_test(model: ImuModel, segments: Sequence[DataSegment]) -> BaselineTest:
+def _imu_test(model: ImuModel, sessions: _Sessions) -> BaselineTest:
     evidence = [
-        imu_window(model, [imu_evidence(model, one) for one in window]) for window in _windows(segments)
+        imu_window(model, [imu_evidence(model, one) for one in window]) for window in _windows(sessions)
     ]
     return _calibrated(evidence, model.prior_sigma, link_changes(model.chain))
 
 
 def _drive(
-    kind: ModuleType, segments: Sequence[DataSegment], joint: int, compared: bool
+    kind: ModuleType, sessions: _Sessions, joint: int, compared: bool
 ) -> tuple[DriveModel, BaselineTest | None]:
-    parts = [drive_rows(kind, one, joint) for one in segments]
+    parts = [drive_rows(kind, one, joint) for one in _stretches(sessions)]
     rows, torque = (np.concatenate(column) for column in zip(*parts, strict=True))
     theta, noise = catalogued_drive(kind), kind.max_effort_nm
     if len(rows):
@@ -354,7 +362,7 @@ def _drive(
         return model, None
     windows = [
         [e for one in window if (e := drive_evidence(model, one, joint)) is not None]
-        for window in _windows(segments)
+        for window in _windows(sessions)
     ]
     evidence = [drive_window(window) for window in windows if window]
     known = len(evidence) >= MIN_WINDOWS
@@ -373,8 +381,13 @@ def _calibrated(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[
     return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * largest)
 
 
-def _windows(segments: Sequence[DataSegment]) -> list[Sequence[DataSegment]]:
-    return [segments[WINDOW * k : WINDOW * (k + 1)] for k in range(len(segments) // WINDOW)]
+def _windows(sessions: _Sessions) -> list[Sequence[DataSegment]]:
+    """Return windows, none of which begins in one session and ends in the next."""
+    return [own[WINDOW * k : WINDOW * (k + 1)] for own in sessions for k in range(len(own) // WINDOW)]
+
+
+def _stretches(sessions: _Sessions) -> list[DataSegment]:
+    return [one for own in sessions for one in own]
 
 
 # Allowed false alarms, of all tests together.

@@ -14,11 +14,11 @@ eta of what drives and all of what is driven back, has
     m = k N i (eta or 1) = c tau + l sign(w) |tau| + Fc sign(w) + Fv w + J w' + T tau' + offset,
 
 tau the spring's torque as read, c and l what motor constant and losses are off their type's (1 and 0; Khalil
-and Dombre 2002, section 9.6, for the rest), T by what the reading lags behind what the spring transmits (its
-own damping; `torque_terms`): as tau' of a quick motion goes against its speed, less friction would else
-explain it. The motor's side stands alone on the left, as a joint that carries nothing would else be explained
-best by no motor at all. Only where the motor turns is friction what it seems, so that slow samples do not
-count.
+and Dombre 2002, section 9.6, for the rest), T [s] the time by which the reading lags behind what the spring
+transmits (its own damping; `torque_terms`): in quick motions, where inertia prevails, tau' goes against the
+speed, and less friction would else explain it. The motor's side stands alone on the left, as a joint that
+carries nothing would else be explained best by no motor at all. Only where the motor turns is friction what
+it seems, so that slow samples do not count.
 """
 
 from collections.abc import Sequence
@@ -242,7 +242,7 @@ REACH_SAMPLES = 10
 MIN_SAMPLES = 20
 # Of c and l: what a joint that carries little tells of them is not what they are under another load.
 OWN_SIGMA = np.array([0.1, 0.1])
-# By which the readings of springs lag: rubber damps, of steel there is nothing to be seen.
+# Standard deviation of the lag of a spring's reading about none: rubber damps.
 _LAG_SIGMA_S = 5e-3
 
 

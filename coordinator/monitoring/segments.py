@@ -78,7 +78,7 @@ class _Track(NamedTuple):
 class Alignment:
     """Turns a recording that grows into blocks, each beginning where the last one ended.
 
-    The first one begins at `from_ns` of session time, or as soon as all modules have rows.
+    The first one begins at `from_ns` of session time, or once all modules have rows, whichever is later.
     """
 
     def __init__(self, serials: Sequence[str], from_ns: int = 0):
@@ -88,7 +88,10 @@ class Alignment:
     def advance(
         self, recording: Recording, clocks: Mapping[str, ClockMap], until_ns: int | None = None
     ) -> Aligned:
-        """Return the samples that all modules have since the last call, before a session time if given."""
+        """Return the samples that all modules have since the last call, before a session time if given.
+
+        A hole that reaches beyond that time, or over `from_ns`, shortens the block and is not named.
+        """
         spans = [self._span(recording, clocks, s) for s in self._serials]
         known = [span for span in spans if span is not None]
         if len(known) < len(spans):
@@ -103,7 +106,7 @@ class Alignment:
             self._next_ns = _on_grid(max(self._from_ns, *(first for first, _ in known)))
         end = min(last for _, last in known)
         if until_ns is not None:
-            end = min(end, until_ns + MAX_GAP_NS)
+            end = min(end, until_ns + _ROWS_AROUND * STEP_NS)
         tracks = [_track(recording, clocks[s], s, self._next_ns, end) for s in self._serials]
         gaps = tuple(
             gap
@@ -117,6 +120,7 @@ class Alignment:
         whole = [track for track in tracks if track is not None and len(track.t_ns) > _ROWS_AROUND]
         if len(whole) < len(tracks):
             return Aligned(None, (), silent)
+        self._next_ns = max(self._next_ns, _on_grid(max(int(track.t_ns[0]) for track in whole)))
         # Two rows beyond the last sample are needed for the cubic.
         ends = [int(t[-2]) for track in whole for t in (track.t_ns, track.imu_t_ns)]
         stop = min(ends) if until_ns is None else min(*ends, until_ns)

@@ -253,11 +253,12 @@ def test_a_resumed_run_says_what_is_normal_by_the_steps_of_its_sessions(
     known = load_baseline(out)
     motions, (before, after) = steps_of_run(known)
     assert len(motions) == 4
-    begun = {e.step: e.t_ns for e in known.recording.journal if e.what == "begin"}
-    # The motion in which the coordinator died is made again.
-    assert before.t_ns[-1] < 28.0 * NS_PER_S
-    assert after.t_ns[0] > again_ns
-    assert before.t_ns[-1] < begun["dynamic/1"] < after.t_ns[-1]
+    begun = [(e.step, e.t_ns) for e in known.recording.journal if e.what == "begin"]
+    # The motion in which the coordinator died is made again, and what it left of it is not looked at.
+    died_ns, _ = (t_ns for step, t_ns in begun if step == "dynamic/1")
+    assert died_ns - 8e6 < before.t_ns[-1] < died_ns
+    first_ns = min(t_ns for _, t_ns in begun if t_ns > again_ns)
+    assert first_ns <= after.t_ns[0] < first_ns + 4e6
     assert build_reference(known).together
 
 

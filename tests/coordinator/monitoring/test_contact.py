@@ -62,13 +62,24 @@ def test_noise_crosses_its_level_as_often_as_rice_says() -> None:
     # A second-order low-pass of white noise has a finite rate of crossings.
     noise = lfilter([1.0], np.convolve([1.0, -0.8], [1.0, -0.8]), rng.normal(size=(400_000, 1)), axis=0)
     noise /= noise.std()
-    model = contact_model(noise)._replace(largest_nm=np.zeros(1))
+    model = contact_model([noise])._replace(largest_nm=np.zeros(1))
     asked = 3600.0 * 0.5
     level = model.level_nm(asked)[0]
     beyond = np.abs(noise[:, 0]) > level
     rate = np.count_nonzero(~beyond[:-1] & beyond[1:]) / (len(noise) / RATE_HZ)
     # 800 crossings in 1600 s: within 15 %, as samples miss crossings between them.
     assert rate == pytest.approx(0.5, rel=0.15)
+
+
+def test_where_a_session_begins_is_no_contact_in_what_is_normal() -> None:
+    """The model's error of the pose in which it begins is a step to a low-pass that begins with it."""
+    noise = np.random.default_rng(4).normal(scale=0.01, size=(2000, 1))
+    session = noise + 0.3 * np.exp(-np.arange(2000) / (0.1 * RATE_HZ))[:, None]
+    one, two = contact_model([session]), contact_model([session, session])
+    assert one.largest_nm == pytest.approx(two.largest_nm)
+    assert one.largest_nm[0] < 0.06
+    assert two.sigma_nm == pytest.approx(one.sigma_nm)
+    assert two.crossings_hz == pytest.approx(one.crossings_hz)
 
 
 def test_a_blow_is_said_when_it_begins_and_when_it_is_over() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coordinator.monitoring.segments import Aligned, Alignment, Block, joined_blocks
+from coordinator.monitoring.segments import Aligned, Alignment, Block, Segmenter, joined_blocks
 from coordinator.recording.recording import Recording
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.feedback_rows import ROW
@@ -100,3 +100,58 @@ def test_a_module_that_vanishes_holds_the_grid_and_is_named() -> None:
 def test_a_module_that_was_never_heard_is_named() -> None:
     found = run(Alignment(SERIALS), Recording(), [("A", k, 5) for k in range(0, 100, 5)])
     assert found[-1] == Aligned(None, (), ("B",))
+
+
+BEGIN_NS = 10_000_000_000
+
+
+def part(missing: range, from_ms: float, until_ms: float) -> Aligned:
+    """Return what is between two times of two seconds of rows, of which B lacks some."""
+    recording = Recording()
+    for serial, first, count in both(0, 500):
+        if serial == "A" or first not in missing:
+            hear(recording, serial, first, count)
+    alignment = Alignment(SERIALS, BEGIN_NS + round(1e6 * from_ms))
+    return alignment.advance(recording, CLOCKS, BEGIN_NS + round(1e6 * until_ms))
+
+
+@pytest.mark.parametrize(("from_ms", "first_ms"), [(400.0, 400.0), (400.1, 404.0), (-50.0, 4.0)])
+@pytest.mark.parametrize(("until_ms", "last_ms"), [(1200.0, 1196.0), (1200.1, 1200.0)])
+def test_a_span_begins_and_ends_where_it_is_asked_to(
+    from_ms: float, first_ms: float, until_ms: float, last_ms: float
+) -> None:
+    block = part(range(0), from_ms, until_ms).block
+    assert block is not None
+    assert list(block.t_ns[[0, -1]]) == [BEGIN_NS + 1e6 * first_ms, BEGIN_NS + 1e6 * last_ms]
+    np.testing.assert_allclose(block.q_rad[2:, 1], angle(block.t_ns[2:], "B"), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("missing", "first_ms", "last_ms"),
+    [
+        pytest.param(range(60, 150), 604.0, 1196.0, id="over the beginning"),
+        pytest.param(range(250, 400), 400.0, 992.0, id="over the end"),
+    ],
+)
+def test_a_hole_over_an_end_of_a_span_shortens_it(missing: range, first_ms: float, last_ms: float) -> None:
+    """Nothing is extrapolated into it."""
+    found = part(missing, 400.0, 1200.0)
+    assert found.block is not None
+    assert not found.gaps
+    assert list(found.block.t_ns[[0, -1]]) == [BEGIN_NS + 1e6 * first_ms, BEGIN_NS + 1e6 * last_ms]
+    assert np.abs(found.block.q_rad).max() < 1.001
+
+
+def test_a_hole_within_a_span_is_named_and_a_span_of_no_time_is_empty() -> None:
+    assert [gap.serial for gap in part(range(150, 200), 400.0, 1200.0).gaps] == ["B"]
+    assert part(range(0), 400.0, 400.0) == Aligned(None, (), ())
+
+
+def test_torques_of_a_segment_change_as_fast_as_they_do() -> None:
+    t_ns = np.arange(400) * 4_000_000
+    zero, three = np.zeros((400, 1)), np.zeros((400, 1, 3))
+    turn = 2.0 * np.pi * 2.0
+    tau = np.sin(turn * 1e-9 * t_ns)[:, None]
+    (first, *_) = Segmenter().add(Block(t_ns, zero, zero, tau, zero, zero, three, three))
+    expected = turn * np.cos(turn * 1e-9 * first.t_ns)
+    np.testing.assert_allclose(first.tau_rate_nm_s[:, 0], expected, atol=2e-3 * turn)
