@@ -52,7 +52,7 @@ SHORTER = {
     "x5-coordinator excite": ("--tries", "30"),
     "x5-sim benchmark kinematics": ("--trials", "1"),
     "x5-sim benchmark dynamics": ("--only", "regressor"),
-    "x5-sim watch": ("--hours", "0.005"),
+    "x5-sim watch": ("--hours", "0.005", "--trials", "0"),
 }
 SHORTER_PLAN = """
 discover_s = 0.5
