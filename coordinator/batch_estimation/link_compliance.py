@@ -23,7 +23,7 @@ from coordinator.batch_estimation.imu_prediction import (
     given,
     turned,
 )
-from coordinator.batch_estimation.sensor_data import SensorData
+from coordinator.batch_estimation.sensor_data import BaseMotion, SensorData
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.imu_prior import HINGE_SHARE, HINGE_SHARE_SIGMA
@@ -35,6 +35,8 @@ HINGE_ASIDE_SIGMA_M = 0.02
 HINGE_SIGMAS = (HINGE_SHARE_SIGMA, HINGE_ASIDE_SIGMA_M, HINGE_ASIDE_SIGMA_M)
 
 
+# A link that gives changes the loads itself: the second round changes the turns by a percent.
+_ROUNDS = 2
 # A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: only
 # the product of load and compliance is observable.
 LINK_MASS_KG, LINK_MASS_KG_M = 0.2, 0.4
@@ -271,6 +273,36 @@ def turns_under(
         load = loads[module]
         if load is not None:
             turns[module] = load.turns(*(UNIT_RAD_NM * pair))
+    return turns
+
+
+def estimated_turns(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    compliance: Array,
+    joints: tuple[Array, Array, Array],
+    rate_hz: float,
+    base: BaseMotion | None = None,
+) -> LinkTurns:
+    """Return how the links of a refined robot turn while its joints move.
+
+    Args:
+        chain: n joints, l links.
+        kinds: (n,) their types.
+        compliance: (5 l,) of `Refinement`; of any other size if it was not estimated: nothing turns then.
+        joints: positions, velocities and accelerations, (m, n) each, over one stretch of time without holes.
+        rate_hz: of the samples. The turns' derivatives are less accurate at the ends of the stretch.
+        base: how the base moved; None at rest.
+    """
+    links = list(chain.linked)
+    turns: LinkTurns = {}
+    if not links or len(compliance) != (2 + len(HINGE_SIGMAS)) * len(links):
+        return turns
+    by_load, hinges = np.split(compliance, [2 * len(links)])
+    for _ in range(_ROUNDS):
+        bodies = body_motions(chain, *joints, base, turns)
+        loads = link_loads(chain, kinds, bodies, joints[0], rate_hz, turns)
+        turns = turns_under(with_hinges_moved([loads], links, hinges)[0], links, by_load)
     return turns
 
 

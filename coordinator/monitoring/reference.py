@@ -37,9 +37,9 @@ from coordinator.monitoring.residual_tests import (
     drive_window,
     fitted_drive,
     imu_evidence,
+    imu_noise,
     imu_window,
     information_of,
-    lasting_residual,
     link_changes,
     payload_changes,
     torque_evidence,
@@ -183,7 +183,7 @@ def build_reference(known: BaselineRobot) -> Reference:
     together = moved_together(recording.motions("dynamic"), len(types))
     factor = 1.0 if together else ALONE_FACTOR
     sigma, information, torque = _torque(chain, phi, sessions)
-    model = _imu_model(known, sessions)
+    model = _imu_model(known, types, sessions)
     compared = together or len(types) <= _ALONE_JOINTS
     drives = [_drive(kind, sessions, joint, compared) for joint, kind in enumerate(types)]
     outside = [MomentumObserver(chain, phi).advance(b.q_rad, b.qd_rad_s, b.tau_nm) for b in blocks]
@@ -328,15 +328,21 @@ def _torque(
     return independent, whole, test
 
 
-def _imu_model(known: BaselineRobot, sessions: _Sessions) -> ImuModel:
+def _imu_model(known: BaselineRobot, types: tuple[ModuleType, ...], sessions: _Sessions) -> ImuModel:
     refinement, count = known.kinematics.refinement, len(known.chain.serials)
     chain = with_placement(known.chain, refinement.placement)
     # Delays are each segment's own.
     errors = refinement.intrinsics.errors.copy()
     errors[:, DELAY] = 0.0
-    rough = ImuModel(chain, ImuIntrinsics(errors), IMU_PRIORS[known.imu], np.full((count, 6), 0.05))
-    sigma, counted = noise_level(lasting_residual(rough, _stretches(sessions)))
-    return rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
+    rough = ImuModel(
+        chain=chain,
+        kinds=types,
+        compliance=refinement.compliance,
+        intrinsics=ImuIntrinsics(errors),
+        prior=IMU_PRIORS[known.imu],
+        sigma=np.full((count, 6), 0.05),
+    )
+    return rough._replace(sigma=imu_noise(rough, _stretches(sessions)))
 
 
 def _imu_test(model: ImuModel, sessions: _Sessions) -> BaselineTest:

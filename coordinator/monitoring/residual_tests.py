@@ -2,7 +2,9 @@
 
 What IMUs say of a link that has changed: rates and specific forces against those of the joints' motion.
 
-A payload changes nothing in them, as encoders sit beyond the springs. A link that is displaced moves every
+A payload changes nothing in them, as encoders sit beyond the springs, but for what links give way under
+their loads, as the known run tells (`estimated_turns`): joints that are caught with a jolt ring on their
+springs, and tubes of 325 mm then shake what they carry by 1 m/s^2. A link that is displaced moves every
 module beyond it by the same twist, linear in the readings as long as it is small (`inertial_slopes`).
 Biases and delays are each stretch's own: they drift, and clocks are mapped anew every day.
 
@@ -28,10 +30,18 @@ import numpy as np
 
 from coordinator.batch_estimation.imu_intrinsics import DELAY, SIZE, ImuIntrinsics, mixing, read, slopes
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
-from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
+from coordinator.batch_estimation.imu_prediction import (
+    BodyMotion,
+    ImuReadings,
+    LinkTurn,
+    body_motions,
+    readings_on,
+)
+from coordinator.batch_estimation.link_compliance import estimated_turns
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, without_first, without_own
-from coordinator.monitoring.segments import DataSegment
+from coordinator.monitoring.segments import DataSegment, noise_level
+from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
@@ -89,12 +99,17 @@ def payload_changes(count: int) -> tuple[Array, ...]:
     return tuple(unit[:, PER_BODY * b : PER_BODY * (b + 1)] for b in range(count))
 
 
-# The low-pass leaves about as many independent samples as one in five.
+# The low-pass leaves about as many independent samples as one in five. Near the ends of a stretch it is not
+# known how links turn, as that takes the joints' fourth derivatives: with them gains exceed chance by a third more.
 KEEP_EVERY = 5
+_KEPT = slice(10, -10, KEEP_EVERY)
 # Of an IMU's errors: those that are the stretch's own, and those that stay.
 _OWN = [*range(18, 24), DELAY]
 _LASTING = [k for k in range(SIZE) if k not in _OWN]
 _PER_TWIST = 6
+# The noise of the IMUs settles in as many rounds.
+_ROUNDS = 5
+_LEAST_NOISE = 1e-5
 ImuSensor = Literal["gyro", "accelerometer"]
 # Biases, and scales of the axes.
 IMU_ERRORS: dict[ImuSensor, tuple[range, range]] = {
@@ -105,17 +120,30 @@ IMU_ERRORS: dict[ImuSensor, tuple[range, range]] = {
 # the known run, and delays against those of no filter at all.
 _LINK_SIGMA, _GRAVITY_SIGMA = 0.02, 0.05
 _OWN_SIGMA = np.array([3e-3] * 3 + [0.05] * 3 + [5e-3])
-# Of a change: 0.1 rad, 0.1 m.
-LARGE = 0.1
+# Of what links' giving way makes of readings: so much is left when they are caught with a jolt.
+_GIVING_SHARE = 0.2
+# Of a change, in radians and metres. A stretch that cannot tell so little says nothing: a wrist that swings
+# alone shakes the arm by less than a count of its encoders, which half a metre of displacement would explain.
+LARGE = 5e-3
 
 
 class ImuModel(NamedTuple):
-    """What IMUs should read, and how well: the chain, the IMUs' errors, and scatters (n, 6) per sample."""
+    """What IMUs should read, and how well.
+
+    chain: n joints. kinds: (n,) their types. compliance: of the links, see `estimated_turns`. intrinsics: the
+    IMUs' errors. sigma: (n, 6) scatter per sample of links that do not give way.
+    """
 
     chain: Chain
+    kinds: tuple[ModuleType, ...]
+    compliance: Array
     intrinsics: ImuIntrinsics
     prior: ImuPrior
     sigma: Array
+
+    def scatter(self, giving: Array) -> Array:
+        """Return the scatter (m, n, 6) of readings, (m, n, 6) of which the links' giving way makes."""
+        return np.hypot(self.sigma, _GIVING_SHARE * giving)
 
     @property
     def own_sigma(self) -> Array:
@@ -132,35 +160,66 @@ class ImuModel(NamedTuple):
         )
 
 
-def _predicted(model: ImuModel, at: DataSegment) -> tuple[list[BodyMotion], ImuReadings, Array]:
-    """Return the bodies' motions, ideal readings, and what the model leaves of the real ones, (m, n, 6)."""
-    bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
-    ideal = readings_on(model.chain, bodies)
-    gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
-    return bodies, ideal, np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
+class _Predicted(NamedTuple):
+    """The samples of a stretch that are kept: the bodies' motions, ideal readings, and what the model leaves.
 
-
-def lasting_residual(model: ImuModel, segments: Sequence[DataSegment]) -> list[Array]:
-    """Return what the model leaves of the readings but for biases and delays that are the same in all.
-
-    Per stretch (m, 6 n).
+    at: the stretch at these samples. giving, residual: (m, n, 6) what of the ideal readings is due to links
+    that give way, and what is left of the real ones.
     """
-    left = [_predicted(model, _thinned(one))[2] for one in segments]
-    rates = [-one.imu_rates[::KEEP_EVERY] for one in segments]
-    whole, late = np.concatenate(left), np.concatenate(rates)
+
+    at: DataSegment
+    bodies: list[BodyMotion]
+    ideal: ImuReadings
+    giving: Array
+    residual: Array
+
+
+def _predicted(model: ImuModel, segment: DataSegment) -> _Predicted:
+    joints = segment.q_rad, segment.qd_rad_s, segment.qdd_rad_s2
+    whole = estimated_turns(model.chain, model.kinds, model.compliance, joints, RATE_HZ)
+    turns = {
+        module: [LinkTurn(turn.hinge, turn.theta_rad[..., _KEPT]) for turn in own]
+        for module, own in whole.items()
+    }
+    at = DataSegment(segment.raw, segment.t_ns[_KEPT], *(signal[_KEPT] for signal in segment[2:]))
+    bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
+    ideal = rigid = readings_on(model.chain, bodies)
+    if turns:
+        bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2, turns=turns)
+        ideal = readings_on(model.chain, bodies, turns)
+    giving = np.concatenate([one - other for one, other in zip(ideal, rigid, strict=True)], axis=2)
+    gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
+    residual = np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
+    return _Predicted(at, bodies, ideal, giving, residual)
+
+
+def imu_noise(model: ImuModel, segments: Sequence[DataSegment]) -> Array:
+    """Return what `ImuModel.sigma` is, as if samples were independent.
+
+    By what the model leaves of the readings, but for biases and delays that are the same in all segments.
+    """
+    expected = [_predicted(model, one) for one in segments]
+    whole = np.concatenate([one.residual for one in expected])
+    late = np.concatenate([-one.at.imu_rates for one in expected])
     whole, late = whole - whole.mean(axis=0), late - late.mean(axis=0)
     # One delay for all six axes of an IMU, weighed by what each scatters.
     weight = 1.0 / np.maximum(whole.var(axis=0), 1e-12)
     delay = (weight * late * whole).sum(axis=(0, 2)) / np.maximum((weight * late**2).sum(axis=(0, 2)), 1e-12)
     settled = whole - delay[:, None] * late
-    ends = np.cumsum([len(one) for one in left])[:-1]
-    return [part.reshape(len(part), -1) for part in np.split(settled, ends)]
+    giving = _GIVING_SHARE * np.concatenate([one.giving for one in expected])
+    sigma, counted = settled.std(axis=0), np.ones(settled.shape[1:])
+    for _ in range(_ROUNDS):
+        # Each sample's share of its scatter that is not by links that give way.
+        own = settled * sigma / np.maximum(np.hypot(sigma, giving), 1e-300)
+        sigma, counted = (one.reshape(sigma.shape) for one in noise_level([own.reshape(len(own), -1)]))
+    return read_only(np.maximum(sigma * np.sqrt(counted), _LEAST_NOISE))
 
 
 def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
     """Return the evidence about own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
-    at, count = _thinned(segment), len(model.chain.serials)
-    bodies, ideal, residual = _predicted(model, at)
+    count = len(model.chain.serials)
+    at, bodies, ideal, giving, residual = _predicted(model, segment)
+    scatter = model.scatter(giving)
     links = len(_OWN) * count
     tilt = links + _PER_TWIST * count
     total = links + len(model.prior_sigma)
@@ -180,8 +239,8 @@ def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
                 tilt + 3 + len(_LASTING) * k + np.arange(len(_LASTING)),
             ]
         )
-        rows = (own / model.sigma[k, :, None]).reshape(len(columns), -1).T
-        part = evidence_of(rows, (residual[:, k] / model.sigma[k]).T.reshape(-1))
+        rows = (own / scatter[:, k].T).reshape(len(columns), -1).T
+        part = evidence_of(rows, (residual[:, k] / scatter[:, k]).T.reshape(-1))
         matrix[np.ix_(columns, columns)] += part.matrix
         vector[columns] += part.vector
     make_read_only((matrix, vector))
@@ -225,11 +284,6 @@ def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:
     """
     turn, shift = LARGE * size[:3], LARGE * size[3:]
     return turn, shift + np.cross(turn, chain.imu_home[child, :3, 3])
-
-
-def _thinned(segment: DataSegment) -> DataSegment:
-    thin = (signal[::KEEP_EVERY] for signal in segment[2:])
-    return DataSegment(segment.raw, segment.t_ns[::KEEP_EVERY], *thin)
 
 
 # c, l, Fc, Fv, J, T, offset: Fc and Fv are what changes.

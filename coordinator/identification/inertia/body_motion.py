@@ -19,8 +19,8 @@ from coordinator.batch_estimation.imu_prediction import (
     body_motions,
     given,
 )
-from coordinator.batch_estimation.link_compliance import link_loads, turns_under, with_hinges_moved
-from coordinator.batch_estimation.sensor_data import BaseMotion, NoiseFloor, SensorData, measured_base_motion
+from coordinator.batch_estimation.link_compliance import estimated_turns
+from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData, measured_base_motion
 from coordinator.dynamics.body_regressor import BodyTrack, body_tracks
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window
 from module_agent.model.catalogue import ModuleType, TorqueKind
@@ -29,9 +29,6 @@ from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate, filtered_signals
 
 MotionSource = Literal["encoders", "structure", "imus"]
-
-# A link that gives changes the loads itself: the second round changes the turns by a percent.
-_ROUNDS = 2
 
 
 class Robot(NamedTuple):
@@ -75,7 +72,9 @@ def body_motion_tracks(robot: Robot, measured: SensorData, imus: bool) -> list[B
     base, gyro, accel = None, measured.gyro_rad_s, measured.accel_m_s2
     if robot.floor is not None:
         base = measured_base_motion(gyro[:, 0], accel[:, 0], robot.floor, RATE_HZ)
-    turns = _turns(robot, measured, base)
+    turns = estimated_turns(
+        robot.chain, robot.kinds, robot.refined.compliance, measured.joints, RATE_HZ, base
+    )
     bodies = body_motions(robot.chain, *measured.joints, base, turns)
     tracks = body_tracks(robot.chain, measured.q_rad, bodies, turns)
     if not imus:
@@ -87,20 +86,6 @@ def body_motion_tracks(robot: Robot, measured: SensorData, imus: bool) -> list[B
         _corrected(measuring, bodies, turns, measured, track, riders[i]) if i in riders else track
         for i, track in enumerate(tracks)
     ]
-
-
-def _turns(robot: Robot, measured: SensorData, base: BaseMotion | None) -> LinkTurns:
-    """Return how links turn; none if the refinement did not estimate compliance."""
-    links = list(robot.chain.linked)
-    turns: LinkTurns = {}
-    if len(robot.refined.compliance) != 5 * len(links):
-        return turns
-    compliance, hinges = np.split(robot.refined.compliance, [2 * len(links)])
-    for _ in range(_ROUNDS):
-        bodies = body_motions(robot.chain, *measured.joints, base, turns)
-        loads = link_loads(robot.chain, robot.kinds, bodies, measured.q_rad, RATE_HZ, turns)
-        turns = turns_under(with_hinges_moved([loads], links, hinges)[0], links, compliance)
-    return turns
 
 
 def _corrected(

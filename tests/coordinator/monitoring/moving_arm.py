@@ -17,11 +17,13 @@ from sim.robot.robot_tree import true_chain, true_inertia
 ROBOT = load_robot("a2085_03")
 CHAIN = true_chain(ROBOT)
 PHI = true_inertia(ROBOT).reshape(-1)
-JOINTS, RATE_HZ = 3, 250.0
+JOINTS, RATE_HZ, SAMPLES = 3, 250.0, 125
 KINDS = [module_type(one.type) for one in ROBOT.modules]
 TORQUE_SIGMA, GYRO_SIGMA, ACCEL_SIGMA = 0.05, 0.01, 0.1
 MODEL = ImuModel(
     CHAIN,
+    tuple(KINDS),
+    np.zeros(0),
     perfect(JOINTS),
     IMU_PRIORS["calibrated"],
     np.tile([GYRO_SIGMA] * 3 + [ACCEL_SIGMA] * 3, (JOINTS, 1)),
@@ -34,16 +36,22 @@ def segments(seed: int, count: int = 10) -> list[DataSegment]:
     return [_segment(rng) for _ in range(count)]
 
 
-def _segment(rng: Generator) -> DataSegment:
-    t = np.arange(125) / RATE_HZ
-    speed, phase = rng.uniform(4.0, 8.0, JOINTS), rng.uniform(0.0, 6.28, JOINTS)
-    start, swing = rng.uniform(-0.5, 0.5, JOINTS), rng.uniform(0.1, 0.3, JOINTS)
-    angle = t[:, None] * speed + phase
-    q, qd, qdd = (
+def swings(
+    samples: Array, start: Array, swing: Array, speed: Array, phase: Array
+) -> tuple[Array, Array, Array]:
+    """Return positions, velocities and accelerations (m, n) of joints that swing, at samples (m,)."""
+    angle = samples[:, None] / RATE_HZ * speed + phase
+    return (
         start + swing * np.sin(angle),
         swing * speed * np.cos(angle),
         -swing * speed**2 * np.sin(angle),
     )
+
+
+def _segment(rng: Generator) -> DataSegment:
+    speed, phase = rng.uniform(4.0, 8.0, JOINTS), rng.uniform(0.0, 6.28, JOINTS)
+    start, swing = rng.uniform(-0.5, 0.5, JOINTS), rng.uniform(0.1, 0.3, JOINTS)
+    q, qd, qdd = swings(np.arange(SAMPLES), start, swing, speed, phase)
     ideal = readings_on(CHAIN, body_motions(CHAIN, q, qd, qdd))
     gyro, accel = read(MODEL.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
     gyro, accel = (
@@ -55,9 +63,9 @@ def _segment(rng: Generator) -> DataSegment:
     signs = np.sign(qd)
     drive = np.stack([_current(tau, qd, qdd), np.zeros_like(tau), signs * np.abs(tau), signs, motor], axis=2)
     drive = np.concatenate([drive, (qdd * motor / np.where(qd, qd, 1.0))[..., None]], axis=2)
-    raw = Block(np.arange(125), q, qd, tau, motor, drive[..., 0], gyro, accel)
+    raw = Block(np.arange(SAMPLES), q, qd, tau, motor, drive[..., 0], gyro, accel)
     noisy = tau + TORQUE_SIGMA * rng.normal(size=tau.shape)
-    rates, tau_rate = np.zeros((125, JOINTS, 6)), np.gradient(tau, 0.004, axis=0)
+    rates, tau_rate = np.zeros((SAMPLES, JOINTS, 6)), np.gradient(tau, 0.004, axis=0)
     return DataSegment(raw, raw.t_ns, q, qd, qdd, noisy, tau_rate, gyro, accel, rates, drive)
 
 

@@ -1,20 +1,38 @@
-"""What a motor's current says of its friction, where the reading of a spring lags behind its torque."""
+"""What currents say of friction where the readings of springs lag, and IMUs of links that give way."""
 
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
+from coordinator.batch_estimation.link_compliance import estimated_turns
 from coordinator.monitoring.likelihood_ratio import Change, find_changes, joined
 from coordinator.monitoring.residual_tests import (
     DriveModel,
+    ImuModel,
     catalogued_drive,
     drive_evidence,
     drive_rows,
     drive_window,
     fitted_drive,
+    imu_evidence,
+    imu_noise,
+    imu_window,
+    link_changes,
 )
 from coordinator.monitoring.segments import DataSegment
-from module_agent.model.chain import Array
-from tests.coordinator.monitoring.moving_arm import JOINTS, KINDS, RATE_HZ, segments
+from module_agent.model.chain import Array, Chain
+from tests.coordinator.monitoring.moving_arm import (
+    ACCEL_SIGMA,
+    CHAIN,
+    GYRO_SIGMA,
+    JOINTS,
+    KINDS,
+    MODEL,
+    RATE_HZ,
+    SAMPLES,
+    segments,
+    swings,
+)
 
 JOINT, KIND = 0, KINDS[0]
 # A load that turns about an upright axis, and the lag of the reading of the spring that turns it.
@@ -32,7 +50,7 @@ def turned(rad_s: float, phase_rad: float, friction: float = 1.0) -> DataSegment
 
     The spring transmits tau = reading + LAG_S reading'.
     """
-    angle = rad_s * np.arange(125) / RATE_HZ + phase_rad
+    angle = rad_s * np.arange(SAMPLES) / RATE_HZ + phase_rad
     speed, change = PEAK_RAD_S * np.cos(angle), -PEAK_RAD_S * rad_s * np.sin(angle)
     # What tau = -I W w sin(a) is behind a low-pass of the first order with the lag as its time constant.
     late = angle - np.arctan(LAG_S * rad_s)
@@ -102,3 +120,102 @@ def test_one_quick_swing_on_a_spring_that_lags_is_no_change_of_friction() -> Non
     worn, more = change_of(usual(), turned(QUICK_RAD_S, -1.2, friction=4.0))
     assert worn.gain > ALARM
     assert more > 1.0
+
+
+# Of both links, bending and twisting [1e-4 rad/Nm], and their hinges where they are expected: soft tubes.
+COMPLIANCE = np.array([6.0, 15.0, 6.0, 15.0, *[0.0] * 6])
+GIVING = MODEL._replace(compliance=COMPLIANCE)
+# A ring of the joints on their springs.
+RING_RAD_S, RING_RAD = 26.0, 0.04
+# Turns are differentiated twice, less well at either end.
+BEYOND_THE_ENDS = 40
+
+
+def jolted(
+    seed: int, more_giving: float = 0.0, moved: Chain = CHAIN, ring_rad: float = RING_RAD
+) -> DataSegment:
+    """Return half a second in which all joints ring on their springs, on links that give way.
+
+    more_giving: by what share of the turns of the links these turn more than by `COMPLIANCE`.
+    """
+    rng = np.random.default_rng(seed)
+    samples = np.arange(-BEYOND_THE_ENDS, SAMPLES + BEYOND_THE_ENDS)
+    speed = RING_RAD_S * rng.uniform(0.9, 1.1, JOINTS)
+    joints = swings(
+        samples,
+        rng.uniform(-0.5, 0.5, JOINTS),
+        np.full(JOINTS, ring_rad),
+        speed,
+        rng.uniform(0.0, 6.28, JOINTS),
+    )
+    compliance = (1.0 + more_giving) * COMPLIANCE
+    turns = estimated_turns(moved, KINDS, compliance, joints, RATE_HZ)
+    ideal = readings_on(moved, body_motions(moved, *joints, turns=turns), turns)
+    within = slice(BEYOND_THE_ENDS, -BEYOND_THE_ENDS)
+    q, qd, qdd = (one[within] for one in joints)
+    noise = rng.normal(size=(2, SAMPLES, JOINTS, 3))
+    any_one = segments(0, 1)[0]
+    return any_one._replace(
+        q_rad=q,
+        qd_rad_s=qd,
+        qdd_rad_s2=qdd,
+        gyro_rad_s=ideal.gyro_rad_s[within] + GYRO_SIGMA * noise[0],
+        accel_m_s2=ideal.accel_m_s2[within] + ACCEL_SIGMA * noise[1],
+    )
+
+
+def link_gains(model: ImuModel, before: list[DataSegment], later: list[DataSegment]) -> list[float]:
+    """Return how much a displacement of each link explains."""
+    known, seen = (imu_window(model, [imu_evidence(model, one) for one in part]) for part in (before, later))
+    return [one.gain for one in find_changes(known, seen, model.prior_sigma, link_changes(model.chain))]
+
+
+def test_links_that_give_way_to_a_jolt_are_not_displaced() -> None:
+    usual, jolt = segments(1, 40), [jolted(seed) for seed in range(6)]
+    # The model of rigid links takes the jolt for a link that is displaced.
+    assert max(link_gains(MODEL, usual, jolt)) > ALARM
+    assert max(link_gains(GIVING, [*usual, *jolt[:3]], jolt[3:])) < ALARM
+
+
+def test_a_displaced_link_is_seen_in_a_jolt() -> None:
+    shift = np.eye(4)
+    shift[:3, 3] = [0.006, 0.008, 0.0]
+    moved = CHAIN._replace(
+        point=CHAIN.point + shift[:3, 3] * [[0.0], [1.0], [1.0]],
+        imu_home=np.stack([CHAIN.imu_home[0], shift @ CHAIN.imu_home[1], shift @ CHAIN.imu_home[2]]),
+    )
+    known = [jolted(seed) for seed in range(20)]
+    gains = link_gains(GIVING, known, [jolted(seed, moved=moved) for seed in range(20, 30)])
+    assert max(gains) > ALARM
+    assert CHAIN.linked[int(np.argmax(gains))] == 1
+
+
+def test_the_noise_of_imus_is_not_what_jolts_leave_of_them() -> None:
+    """Links turn by a sixth more than they are known to."""
+    usual = segments(2, 30)
+    jolts = [jolted(seed, more_giving=1.0 / 6.0, ring_rad=2.5 * RING_RAD) for seed in range(10)]
+    before, after = imu_noise(GIVING, usual), imu_noise(GIVING, [*usual, *jolts])
+    assert np.median(before / MODEL.sigma) == pytest.approx(1.0, abs=0.15)
+    # Of one axis of 18 what is left lasts as long as a jolt; two thirds would have 1.3 to 3 times the noise.
+    assert np.mean(after > 1.2 * before) <= 1.0 / 18.0
+    assert np.median(after / before) == pytest.approx(1.0, abs=0.05)
+
+
+def test_an_arm_that_hardly_moves_has_no_link_displaced_by_half_a_metre() -> None:
+    """Something shakes an arm that stands, and its encoders show half of that."""
+    rng = np.random.default_rng(5)
+    still = np.zeros(JOINTS)
+    q, qd, qdd = swings(np.arange(SAMPLES), still, still + 1.5e-4, still + 45.0, still)
+    seen = readings_on(CHAIN, body_motions(CHAIN, q, 2.0 * qd, 2.0 * qdd))
+    any_one = segments(0, 1)[0]._replace(q_rad=q, qd_rad_s=qd, qdd_rad_s2=qdd)
+    shaken = []
+    for _ in range(10):
+        noise = rng.normal(size=(2, SAMPLES, JOINTS, 3))
+        gyro, accel = seen.gyro_rad_s + GYRO_SIGMA * noise[0], seen.accel_m_s2 + ACCEL_SIGMA * noise[1]
+        shaken.append(any_one._replace(gyro_rad_s=gyro, accel_m_s2=accel))
+    evidence = [[imu_evidence(MODEL, one) for one in part] for part in (segments(1, 40), shaken)]
+    known, later = (imu_window(MODEL, part) for part in evidence)
+    # Of any size, a displacement explains it.
+    large = [20.0 * change for change in link_changes(CHAIN)]
+    assert max(one.gain for one in find_changes(known, later, MODEL.prior_sigma, large)) > ALARM
+    assert max(link_gains(MODEL, segments(1, 40), shaken)) < ALARM
