@@ -183,11 +183,11 @@ def _structure(
     found = test.find(imu_window(reference.imu_model, parts))
     most = most_of(found)
     best, child = found[most], chain.linked[most]
+    sensor = imu_error(test, reference.imu_model, parts)
+    if sensor.gain > max(best.gain + LEAD, thresholds.link):
+        return sensor.detection(chain.serials[sensor.place], thresholds.link)
     if best.gain < thresholds.link:
         return None
-    sensor = imu_error(test, reference.imu_model, parts)
-    if sensor.gain > best.gain + LEAD:
-        return sensor.detection(chain.serials[sensor.place], thresholds.link)
     turn, shift = displacement(chain, child, best.size)
     length = float(np.linalg.norm(shift))
     slope = np.array([shift / max(length, 1e-9) @ displacement(chain, child, unit)[1] for unit in np.eye(6)])

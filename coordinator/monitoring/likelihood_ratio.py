@@ -111,6 +111,11 @@ def without_first(evidence: Evidence, count: int) -> Evidence:
     return Evidence(evidence.matrix[count:, count:], evidence.vector[count:])
 
 
+def tempered(evidence: Evidence, inflation: float) -> Evidence:
+    """Return evidence whose noise has so many times the variance that it was taken to have."""
+    return _read_only(evidence.matrix / inflation, evidence.vector / inflation)
+
+
 def find_changes(
     before: Evidence, later: Evidence, prior_sigma: ArrayLike, changes: Sequence[Array]
 ) -> tuple[Change, ...]:

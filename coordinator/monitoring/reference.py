@@ -406,7 +406,10 @@ _DRIVE_FREEDOM, _LINK_FREEDOM = 2, 6
 
 
 class Thresholds(NamedTuple):
-    """Gains, and torques (n,) of a contact [Nm], that chance exceeds as seldom as asked for."""
+    """Gains, and torques (n,) of a contact [Nm], that chance exceeds as seldom as asked for.
+
+    link: of links and of IMUs, which are each other's rivals.
+    """
 
     payload: float
     link: float
@@ -427,7 +430,8 @@ def thresholds(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -
     looks = len(SPANS) * 3600.0 / SEGMENT_S
     return Thresholds(
         gain_above(PER_BODY, looks * count, each),
-        gain_above(_LINK_FREEDOM, looks * max(len(reference.chain.linked), 1), each),
+        # A gyro's or an accelerometer's biases and scales are as many.
+        gain_above(_LINK_FREEDOM, looks * (len(reference.chain.linked) + 2 * count), each),
         gain_above(_DRIVE_FREEDOM, looks * count, each),
         np.maximum(reference.contact.level_nm(each), MIN_CONTACT * effort),
     )

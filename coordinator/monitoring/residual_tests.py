@@ -100,7 +100,8 @@ def payload_changes(count: int) -> tuple[Array, ...]:
 
 
 # The low-pass leaves about as many independent samples as one in five. Near the ends of a stretch it is not
-# known how links turn, as that takes the joints' fourth derivatives: with them gains exceed chance by a third more.
+# known how links turn, as that takes the joints' fourth derivatives: gains would exceed chance by a third
+# more.
 KEEP_EVERY = 5
 _KEPT = slice(10, -10, KEEP_EVERY)
 # Of an IMU's errors: those that are the stretch's own, and those that stay.

@@ -1,10 +1,14 @@
-"""Which sensor explains best what a window shows, if its errors have changed: a rival of payload and link.
+"""Which sensor explains best what a window shows, if its errors have changed.
 
 A torque sensor has an offset and a scale; a gyro or an accelerometer a bias and a scale on each axis. A
 payload shows in the torques of every joint below it by the lever that it has there, and a displaced link in
 all IMUs beyond it by how its joints turn: only one sensor's error is its own alone. They are judged by the
 same likelihood ratio, with fewer parameters or as many. Where a sensor explains no more than a link or a
 payload, nothing tells them apart, and what happens more often is named: the link or the payload.
+
+An IMU whose biases are other than they drift (`ImuModel.own_sigma`) is named whatever else there is: how far
+biases drift is known before, so that errors of the arm's model, by which all evidence counts for less, do not
+widen it.
 
 The offset of a torque sensor shows in its drive as well, whose motor does not know of it; where a joint turns
 one way more often than the other it passes for friction, now for more and now for less.
@@ -18,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.monitoring.findings import UNITS, Detection, Kind
-from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, most_of
+from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, most_of, tempered
 from coordinator.monitoring.reference import BaselineTest
 from coordinator.monitoring.residual_tests import (
     IMU_ERRORS,
@@ -38,6 +42,7 @@ _TORQUE_SIZES = np.array([1.0, 0.3])
 _IMU_SIZES = {"gyro": np.repeat([0.1, 0.1], 3), "accelerometer": np.repeat([1.0, 0.1], 3)}
 # What the model has no error of to begin with is where it was.
 _FIXED = 1e-9
+_LEAST_WEIGHT = 1e-12
 _PER_UNIT = {"Nm": 1.0, "mrad/s": 1e3, "m/s^2": 1.0}
 
 
@@ -83,7 +88,8 @@ def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evide
 
 def imu_error(test: BaselineTest, model: ImuModel, parts: Sequence[Evidence]) -> SensorError:
     """Return the gyro or accelerometer that explains most of a window's evidence (`imu_evidence`)."""
-    later, best = joined(parts), []
+    later, best = tempered(joined(parts), test.inflation), []
+    test = test._replace(evidence=tempered(test.evidence, test.inflation), inflation=1.0)
     for kind in IMU_ERRORS:
         sizes = _IMU_SIZES[kind]
         columns = imu_error_columns(len(model.chain.serials), kind)
@@ -118,11 +124,13 @@ def _sensor_error(
 ) -> SensorError:
     shares = sizes * change.size
     covariance = sizes[:, None] * change.covariance * sizes
-    # Rows in standard deviations: of the offsets' columns their squares are the samples' weights.
+    # Rows in standard deviations: of the offsets' columns their squares are the samples' weights, which an
+    # axis does not share with the others.
     seen = later.matrix[np.ix_(columns, columns)]
-    weight = float(np.trace(seen[: len(sizes) // 2, : len(sizes) // 2])) / (len(sizes) // 2)
-    error = float(np.sqrt(max(shares @ seen @ shares / weight, 0.0)))
-    slope = seen @ shares / (weight * max(error, 1e-12))
+    weight = np.tile(np.diag(seen)[: len(sizes) // 2], 2)
+    mean = seen / np.maximum(weight, _LEAST_WEIGHT)[:, None]
+    error = float(np.sqrt(max(shares @ mean @ shares, 0.0)))
+    slope = mean @ shares / max(error, 1e-12)
     unit = _PER_UNIT[UNITS[kind]]
     return SensorError(
         kind,

@@ -12,6 +12,7 @@ from coordinator.monitoring.likelihood_ratio import (
     gain_above,
     joined,
     misfit_of,
+    tempered,
     without_own,
 )
 
@@ -82,6 +83,13 @@ def test_joined_evidence_is_that_of_all_samples_in_any_order(rng: Generator) -> 
     for a, b in ((one, other), (one, joined([joined(parts[:2]), parts[2]]))):
         np.testing.assert_allclose(a.matrix, b.matrix, rtol=1e-10)
         np.testing.assert_allclose(a.vector, b.vector, rtol=1e-10)
+
+
+def test_tempered_evidence_is_that_of_samples_with_as_much_more_noise(rng: Generator) -> None:
+    rows, target = measured(rng, np.ones(PARAMETERS))
+    noisier = evidence_of(rows / np.sqrt(30.0), target / np.sqrt(30.0))
+    np.testing.assert_allclose(tempered(evidence_of(rows, target), 30.0).matrix, noisier.matrix)
+    np.testing.assert_allclose(tempered(evidence_of(rows, target), 30.0).vector, noisier.vector)
 
 
 def test_own_parameters_are_left_out_as_a_schur_complement_does(rng: Generator) -> None:

@@ -96,6 +96,21 @@ def test_a_gyro_with_another_scale_is_named(imu_test: BaselineTest) -> None:
     assert found.error == pytest.approx(50.0 * np.sqrt(np.mean(spin**2)), rel=0.1)
 
 
+def test_a_bias_is_as_large_as_it_is_whatever_its_axes_scatter() -> None:
+    """One axis tells ten times as much as the others; the bias is named, however coarse the test is."""
+    sharp = MODEL._replace(sigma=MODEL.sigma * [1.0, 1.0, 1.0, 1.0, 1.0, 0.3])
+    parts = [imu_evidence(sharp, one) for one in segments(1, 60)]
+    bias = 0.8 * np.eye(JOINTS)[1][:, None] * [0.6, 0.0, 0.8]
+    sick = [imu_evidence(sharp, one._replace(accel_m_s2=one.accel_m_s2 + bias)) for one in segments(4)]
+    known = BaselineTest(imu_window(sharp, parts), sharp.prior_sigma, link_changes(CHAIN), inflation=100.0)
+    found = imu_error(known, sharp, sick)
+    assert (found.kind, found.place) == ("accelerometer", 1)
+    assert found.error == pytest.approx(0.8, rel=0.1)
+    # Biases drift by 0.05 m/s^2, so that this is 16 standard deviations of what is usual.
+    assert found.gain > 100.0
+    assert max(change.gain for change in known.find(imu_window(sharp, sick))) < 30.0
+
+
 def test_a_displaced_link_is_no_imu_that_is_off(imu_test: BaselineTest) -> None:
     """What is beyond the link moves by 10 mm: all IMUs there are displaced alike."""
     shift = np.eye(4)
