@@ -33,7 +33,6 @@ from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
     ImuReadings,
-    LinkTurn,
     body_motions,
     readings_on,
 )
@@ -48,6 +47,7 @@ from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.information import JointInformation, gather
 from module_agent.model.read_only import make_read_only, read_only
 from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regressor
+from module_agent.signals.filtering import differentiate
 
 # How far parameters may be from where a fit has them, per `parameter_scale`: bodies weigh some hundred grams.
 PRIOR_KG = 0.5
@@ -110,7 +110,7 @@ _LASTING = [k for k in range(SIZE) if k not in _OWN]
 _PER_TWIST = 6
 # The noise of the IMUs settles in as many rounds.
 _ROUNDS = 5
-_LEAST_NOISE = 1e-5
+_MIN_NOISE = 1e-5
 ImuSensor = Literal["gyro", "accelerometer"]
 # Biases, and scales of the axes.
 IMU_ERRORS: dict[ImuSensor, tuple[range, range]] = {
@@ -121,8 +121,9 @@ IMU_ERRORS: dict[ImuSensor, tuple[range, range]] = {
 # the known run, and delays against those of no filter at all.
 _LINK_SIGMA, _GRAVITY_SIGMA = 0.02, 0.05
 _OWN_SIGMA = np.array([3e-3] * 3 + [0.05] * 3 + [5e-3])
-# Of what links' giving way makes of readings: so much is left when they are caught with a jolt.
-_GIVING_SHARE = 0.2
+# Of what links' giving way makes of readings: how much of it is uncertain, and by how much later or earlier
+# it may come. An arm that rings at 12 Hz bends by as much as expected, but 12 ms later.
+_GIVING_SHARE, _GIVING_LATE_S = 0.1, 0.01
 # Of a change, in radians and metres. A stretch that cannot tell so little says nothing: a wrist that swings
 # alone shakes the arm by less than a count of its encoders, which half a metre of displacement would explain.
 LARGE = 5e-3
@@ -142,10 +143,6 @@ class ImuModel(NamedTuple):
     prior: ImuPrior
     sigma: Array
 
-    def scatter(self, giving: Array) -> Array:
-        """Return the scatter (m, n, 6) of readings, (m, n, 6) of which the links' giving way makes."""
-        return np.hypot(self.sigma, _GIVING_SHARE * giving)
-
     @property
     def own_sigma(self) -> Array:
         """How far a stretch's own parameters may be from the known, (7 n,)."""
@@ -164,34 +161,34 @@ class ImuModel(NamedTuple):
 class _Predicted(NamedTuple):
     """The samples of a stretch that are kept: the bodies' motions, ideal readings, and what the model leaves.
 
-    at: the stretch at these samples. giving, residual: (m, n, 6) what of the ideal readings is due to links
-    that give way, and what is left of the real ones.
+    at: the stretch at these samples. uncertain: (m, n, 6) standard deviation of the ideal readings, as links
+    give way otherwise than expected. residual: (m, n, 6) of the real ones.
     """
 
     at: DataSegment
     bodies: list[BodyMotion]
     ideal: ImuReadings
-    giving: Array
+    uncertain: Array
     residual: Array
 
 
 def _predicted(model: ImuModel, segment: DataSegment) -> _Predicted:
     joints = segment.q_rad, segment.qd_rad_s, segment.qdd_rad_s2
-    whole = estimated_turns(model.chain, model.kinds, model.compliance, joints, RATE_HZ)
-    turns = {
-        module: [LinkTurn(turn.hinge, turn.theta_rad[..., _KEPT]) for turn in own]
-        for module, own in whole.items()
-    }
-    at = DataSegment(segment.raw, segment.t_ns[_KEPT], *(signal[_KEPT] for signal in segment[2:]))
-    bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
-    ideal = rigid = readings_on(model.chain, bodies)
+    bodies = body_motions(model.chain, *joints)
+    rigid = readings_on(model.chain, bodies)
+    ideal, uncertain = rigid, np.zeros(segment.imu_rates.shape)
+    turns = estimated_turns(model.chain, model.kinds, model.compliance, joints, RATE_HZ)
     if turns:
-        bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2, turns=turns)
+        bodies = body_motions(model.chain, *joints, turns=turns)
         ideal = readings_on(model.chain, bodies, turns)
-    giving = np.concatenate([one - other for one, other in zip(ideal, rigid, strict=True)], axis=2)
+        giving = np.concatenate([one - other for one, other in zip(ideal, rigid, strict=True)], axis=2)
+        uncertain = np.hypot(_GIVING_SHARE * giving, _GIVING_LATE_S * differentiate(giving, RATE_HZ))
+    at = DataSegment(segment.raw, segment.t_ns[_KEPT], *(signal[_KEPT] for signal in segment[2:]))
+    bodies = [BodyMotion(*(signal[:, _KEPT] for signal in body)) for body in bodies]
+    ideal = ImuReadings(*(signal[_KEPT] for signal in ideal))
     gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
     residual = np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
-    return _Predicted(at, bodies, ideal, giving, residual)
+    return _Predicted(at, bodies, ideal, uncertain[_KEPT], residual)
 
 
 def imu_noise(model: ImuModel, segments: Sequence[DataSegment]) -> Array:
@@ -207,20 +204,20 @@ def imu_noise(model: ImuModel, segments: Sequence[DataSegment]) -> Array:
     weight = 1.0 / np.maximum(whole.var(axis=0), 1e-12)
     delay = (weight * late * whole).sum(axis=(0, 2)) / np.maximum((weight * late**2).sum(axis=(0, 2)), 1e-12)
     settled = whole - delay[:, None] * late
-    giving = _GIVING_SHARE * np.concatenate([one.giving for one in expected])
+    uncertain = np.concatenate([one.uncertain for one in expected])
     sigma, counted = settled.std(axis=0), np.ones(settled.shape[1:])
     for _ in range(_ROUNDS):
         # Each sample's share of its scatter that is not by links that give way.
-        own = settled * sigma / np.maximum(np.hypot(sigma, giving), 1e-300)
+        own = settled * sigma / np.maximum(np.hypot(sigma, uncertain), 1e-300)
         sigma, counted = (one.reshape(sigma.shape) for one in noise_level([own.reshape(len(own), -1)]))
-    return read_only(np.maximum(sigma * np.sqrt(counted), _LEAST_NOISE))
+    return read_only(np.maximum(sigma * np.sqrt(counted), _MIN_NOISE))
 
 
 def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
     """Return the evidence about own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
     count = len(model.chain.serials)
-    at, bodies, ideal, giving, residual = _predicted(model, segment)
-    scatter = model.scatter(giving)
+    at, bodies, ideal, uncertain, residual = _predicted(model, segment)
+    scatter = np.hypot(model.sigma, uncertain)
     links = len(_OWN) * count
     tilt = links + _PER_TWIST * count
     total = links + len(model.prior_sigma)

@@ -42,7 +42,7 @@ _TORQUE_SIZES = np.array([1.0, 0.3])
 _IMU_SIZES = {"gyro": np.repeat([0.1, 0.1], 3), "accelerometer": np.repeat([1.0, 0.1], 3)}
 # What the model has no error of to begin with is where it was.
 _FIXED = 1e-9
-_LEAST_WEIGHT = 1e-12
+_MIN_WEIGHT = 1e-12
 _PER_UNIT = {"Nm": 1.0, "mrad/s": 1e3, "m/s^2": 1.0}
 
 
@@ -128,7 +128,7 @@ def _sensor_error(
     # axis does not share with the others.
     seen = later.matrix[np.ix_(columns, columns)]
     weight = np.tile(np.diag(seen)[: len(sizes) // 2], 2)
-    mean = seen / np.maximum(weight, _LEAST_WEIGHT)[:, None]
+    mean = seen / np.maximum(weight, _MIN_WEIGHT)[:, None]
     error = float(np.sqrt(max(shares @ mean @ shares, 0.0)))
     slope = mean @ shares / max(error, 1e-12)
     unit = _PER_UNIT[UNITS[kind]]
