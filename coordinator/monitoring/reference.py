@@ -221,7 +221,7 @@ def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], list[Block]]:
     except DataError as error:
         raise UnsuitableBaseline(f"{known.folder}: {error}") from error
     blocks = []
-    for begin_ns, end_ns in _spans(since_joined(recording.journal)):
+    for begin_ns, end_ns in session_spans(since_joined(recording.journal)):
         aligned = Alignment(serials, begin_ns).advance(recording, clocks, end_ns)
         if aligned.gaps:
             lost = ", ".join(f"module {gap.serial}" for gap in aligned.gaps)
@@ -235,7 +235,7 @@ def steps_of_run(known: BaselineRobot) -> tuple[list[JointMotion], list[Block]]:
     return motions, blocks
 
 
-def _spans(journal: Sequence[JournalEvent]) -> list[tuple[int, int]]:
+def session_spans(journal: Sequence[JournalEvent]) -> list[tuple[int, int]]:
     """Return the session times at which the first step of every session began and its last one was done."""
     sessions: list[list[JournalEvent]] = [[]]
     for event in journal:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coordinator.monitoring.reference import fitted_torques, moved_together
+from coordinator.monitoring.reference import fitted_torques, moved_together, session_spans
 from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.recording.journal import JournalEvent
@@ -40,6 +40,22 @@ def test_two_of_six_joints_that_move_at_once_do_not_show_how_all_of_them_move() 
 
 def test_a_single_joint_has_none_to_move_with() -> None:
     assert moved_together(_motions("A"), 1)
+
+
+def _session(from_ns: int, *whats: str) -> list[JournalEvent]:
+    """Return a session's events, a nanosecond apart."""
+    return [
+        JournalEvent(t_ns=from_ns + k, what=what)  # type: ignore[arg-type]
+        for k, what in enumerate(("session", *whats))
+    ]
+
+
+def test_a_session_spans_its_first_step_to_the_last_that_was_done() -> None:
+    """What broke off is not how a robot usually moves, nor is a session that completed nothing."""
+    broken_off = _session(0, "motion", "begin", "motion", "done", "begin", "motion", "failed")
+    nothing_done = _session(100, "begin", "motion", "failed")
+    whole = _session(200, "begin", "motion", "done", "begin", "done", "finished")
+    assert session_spans([*broken_off, *nothing_done, *whole]) == [(1, 4), (201, 205)]
 
 
 # What sensors of the first joint, which carries all, and of the last read of nothing [Nm].
