@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, lstsq
+from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from coordinator.baseline.baseline_robot import BaselineRobot
@@ -25,6 +26,7 @@ from coordinator.monitoring.likelihood_ratio import (
     gain_above,
     joined,
     misfit_of,
+    tempered,
 )
 from coordinator.monitoring.momentum_observer import MomentumObserver
 from coordinator.monitoring.residual_tests import (
@@ -103,7 +105,11 @@ class UnsuitableBaseline(UsageError):
 
 
 class BaselineTest(NamedTuple):
-    """Evidence of the known run about one thing, and by how much its tests' gains are inflated there."""
+    """Evidence of the known run about one thing.
+
+    inflation: by how much the variance of noise is larger than it was taken to be, as the model is not exact:
+    all evidence is tempered by it, and priors are not.
+    """
 
     evidence: Evidence
     prior_sigma: Array
@@ -111,15 +117,16 @@ class BaselineTest(NamedTuple):
     inflation: float
 
     def find(self, later: Evidence) -> tuple[Change, ...]:
-        """Test a later window; gains are those of well-behaved noise."""
-        return tuple(
-            c._replace(gain=c.gain / self.inflation, covariance=c.covariance * self.inflation)
-            for c in find_changes(self.evidence, later, self.prior_sigma, self.changes)
-        )
+        """Test a later window."""
+        return find_changes(self._tempered, tempered(later, self.inflation), self.prior_sigma, self.changes)
 
     def misfit(self, later: Evidence) -> float:
         """Return what there is to explain of a later window, as gains are."""
-        return misfit_of(self.evidence, later, self.prior_sigma) / self.inflation
+        return misfit_of(self._tempered, tempered(later, self.inflation), self.prior_sigma)
+
+    @property
+    def _tempered(self) -> Evidence:
+        return tempered(self.evidence, self.inflation)
 
 
 class Reference(NamedTuple):
@@ -323,7 +330,7 @@ def _torque(
         torque_window([torque_evidence(chain, phi, independent, one) for one in window])
         for window in _windows(sessions)
     ]
-    test = _calibrated(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
+    test = calibrated_test(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
     whole = merge(*(information_of(chain, one) for window in _windows(sessions) for one in window))
     return independent, whole, test
 
@@ -349,7 +356,7 @@ def _imu_test(model: ImuModel, sessions: _Sessions) -> BaselineTest:
     evidence = [
         imu_window(model, [imu_evidence(model, one) for one in window]) for window in _windows(sessions)
     ]
-    return _calibrated(evidence, model.prior_sigma, link_changes(model.chain))
+    return calibrated_test(evidence, model.prior_sigma, link_changes(model.chain))
 
 
 def _drive(
@@ -372,19 +379,33 @@ def _drive(
     ]
     evidence = [drive_window(window) for window in windows if window]
     known = len(evidence) >= MIN_WINDOWS
-    return model, _calibrated(evidence, model.prior_sigma, (model.change,)) if known else None
+    return model, calibrated_test(evidence, model.prior_sigma, (model.change,)) if known else None
 
 
-def _calibrated(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array, ...]) -> BaselineTest:
-    """Return what all windows say, and by how much the tests of each against the others exceed chance."""
+def calibrated_test(
+    windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array, ...]
+) -> BaselineTest:
+    """Return what all windows say, inflated so that each agrees with the others, and by a margin more."""
     # The median of the largest gain that chance makes in as many tests.
     expected = [chdtri(change.shape[1], 0.5 / (len(windows) * len(changes))) for change in changes]
-    largest = 1.0
-    for k, window in enumerate(windows):
-        found = find_changes(joined([*windows[:k], *windows[k + 1 :]]), window, prior_sigma, changes)
-        gains = [change.gain / level for change, level in zip(found, expected, strict=True)]
-        largest = max([largest, *gains])
-    return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * largest)
+    others = [joined([*windows[:k], *windows[k + 1 :]]) for k in range(len(windows))]
+
+    def excess(log_inflation: float) -> float:
+        """Return the logarithm of the largest gain over what chance makes."""
+        inflation, largest = float(np.exp(log_inflation)), 0.0
+        for other, window in zip(others, windows, strict=True):
+            test = BaselineTest(other, prior_sigma, changes, inflation)
+            gains = [change.gain / level for change, level in zip(test.find(window), expected, strict=True)]
+            largest = max([largest, *gains])
+        return float(np.log(max(largest, _NO_NOISE)))
+
+    exact, lower, upper = 0.0, 0.0, excess(0.0)
+    if upper > 0.0:
+        # More noise makes less of every gain, but of some by less than in proportion, as priors hold it back.
+        while excess(upper) > 0.0:
+            lower, upper = upper, 2.0 * upper
+        exact = brentq(excess, lower, upper, xtol=0.01)
+    return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * float(np.exp(exact)))
 
 
 def _windows(sessions: _Sessions) -> list[Sequence[DataSegment]]:

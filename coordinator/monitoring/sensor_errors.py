@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.monitoring.findings import UNITS, Detection, Kind
-from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, most_of, tempered
+from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, most_of
 from coordinator.monitoring.reference import BaselineTest
 from coordinator.monitoring.residual_tests import (
     IMU_ERRORS,
@@ -88,8 +88,7 @@ def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evide
 
 def imu_error(test: BaselineTest, model: ImuModel, parts: Sequence[Evidence]) -> SensorError:
     """Return the gyro or accelerometer that explains most of a window's evidence (`imu_evidence`)."""
-    later, best = tempered(joined(parts), test.inflation), []
-    test = test._replace(evidence=tempered(test.evidence, test.inflation), inflation=1.0)
+    later, best = joined(parts), []
     for kind in IMU_ERRORS:
         sizes = _IMU_SIZES[kind]
         columns = imu_error_columns(len(model.chain.serials), kind)

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from coordinator.monitoring.reference import fitted_torques, moved_together, session_spans
+from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of
+from coordinator.monitoring.reference import (
+    MARGIN,
+    calibrated_test,
+    fitted_torques,
+    moved_together,
+    session_spans,
+)
 from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.recording.journal import JournalEvent
@@ -56,6 +63,38 @@ def test_a_session_spans_its_first_step_to_the_last_that_was_done() -> None:
     nothing_done = _session(100, "begin", "motion", "failed")
     whole = _session(200, "begin", "motion", "done", "begin", "done", "finished")
     assert session_spans([*broken_off, *nothing_done, *whole]) == [(1, 4), (201, 205)]
+
+
+# Of four parameters the first two may change: by any size, or by some hundredths.
+CHANGE = np.eye(4)[:, :2]
+SMALL_CHANGE = 0.05 * CHANGE
+
+
+def _noisy_windows(noise: float, rows: int = 60) -> list[Evidence]:
+    """Return windows of one robot whose samples scatter by so many times what they are taken to."""
+    rng = np.random.default_rng(4)
+    windows = []
+    for _ in range(20):
+        slopes = rng.normal(size=(rows, 4))
+        windows.append(evidence_of(slopes, slopes @ np.ones(4) + noise * rng.normal(size=rows)))
+    return windows
+
+
+def test_what_a_model_leaves_is_noise_by_which_windows_agree() -> None:
+    """Chance sets the largest of twenty gains, within a factor of two nearly always."""
+    wide = np.full(4, 10.0)
+    assert calibrated_test(_noisy_windows(0.5), wide, (CHANGE,)).inflation == MARGIN
+    inflation = calibrated_test(_noisy_windows(5.0), wide, (CHANGE,)).inflation
+    assert inflation == pytest.approx(25.0 * MARGIN, rel=0.5)
+
+
+def test_a_window_that_cannot_tell_so_small_a_change_inflates_nothing() -> None:
+    """With a sigma of a third it says that a parameter has changed by four, where some hundredths are likely."""
+    odd = evidence_of(3.0 * np.eye(4)[:1], [15.0])
+    windows = [*_noisy_windows(0.5), odd]
+    assert calibrated_test(windows, np.full(4, 10.0), (SMALL_CHANGE,)).inflation == MARGIN
+    # Were a change of any size as likely, all windows would count for less.
+    assert calibrated_test(windows, np.full(4, 10.0), (10.0 * CHANGE,)).inflation > 10.0 * MARGIN
 
 
 # What sensors of the first joint, which carries all, and of the last read of nothing [Nm].
