@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.contact import Contact
-from coordinator.monitoring.findings import Detection
+from coordinator.monitoring.findings import Detection, Kind
 from coordinator.monitoring.likelihood_ratio import Evidence, most_of
 from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
@@ -46,6 +46,8 @@ LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
 MOVING_RAD_S = 0.02
 # Friction changes by more than that with the weather.
 MIN_FRICTION = 0.1
+# Of the readings of an IMU [mrad/s, m/s^2]: what its biases drift by in an hour.
+MIN_IMU_ERROR: dict[Kind, float] = {"gyro": 3.0, "accelerometer": 0.05}
 # A change that is all there is leaves no more of the misfit than chance does in one window of so many.
 ONE_IN = 1e4
 # A mass that is not known to this many standard deviations is not said to be there.
@@ -174,8 +176,6 @@ def _structure(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
 ) -> Detection | None:
     chain, test = reference.chain, reference.imu
-    if test is None:
-        return None
     # At rest an IMU shows which way is down, by its own errors and in whatever pose, and no length.
     if not chain.linked or 2 * sum(segment.moved for segment in window) < len(window):
         return None
@@ -185,7 +185,8 @@ def _structure(
     best, child = found[most], chain.linked[most]
     sensor = imu_error(test, reference.imu_model, parts)
     if sensor.gain > max(best.gain + LEAD, thresholds.link):
-        return sensor.detection(chain.serials[sensor.place], thresholds.link)
+        large = sensor.error > MIN_IMU_ERROR[sensor.kind] + 3.0 * sensor.sigma
+        return sensor.detection(chain.serials[sensor.place], thresholds.link) if large else None
     if best.gain < thresholds.link:
         return None
     turn, shift = displacement(chain, child, best.size)
@@ -286,10 +287,9 @@ def weighed(
 
 def unexplained(reference: Reference, thresholds: Thresholds, load: LoadShift) -> Detection:
     """Return torques that no payload on one body explains."""
-    link = "" if reference.imu is not None else "a link is displaced, "
     summary = (
         "the torques have changed in a way that no payload on one body explains: something holds the robot, "
-        f"several things were added, {link}or a joint's torque sensor is off"
+        "several things were added, or a joint's torque sensor is off"
     )
     serial = reference.chain.serials[load.carrier]
     return Detection("unexplained", serial, 0.0, 0.0, load.gain, thresholds.payload, summary)

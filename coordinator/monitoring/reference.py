@@ -85,9 +85,6 @@ MARGIN = 3.0
 # A robot whose joints moved one at a time has not shown how their torques add up. By so much larger are the
 # errors of its model when all move: with `MARGIN` of contacts, 2.2 times at most in eight arms of six joints.
 ALONE_FACTOR = 2.5
-# Nor how its bodies give way to each other: in lives of two hours links and friction of twelve arms of three
-# joints were as known, and those of ten arms of six joints were wrong up to a hundred times the threshold.
-_ALONE_JOINTS = 3
 # Standard deviation of a catalogued body, per `parameter_scale` about its centre of mass: what brackets,
 # cables and a tool add.
 BODY_SIGMA_KG = 0.1
@@ -120,6 +117,10 @@ class BaselineTest(NamedTuple):
         """Test a later window."""
         return find_changes(self._tempered, tempered(later, self.inflation), self.prior_sigma, self.changes)
 
+    def coarser(self, factor: float) -> "BaselineTest":
+        """Return the test with a noise that is so many times as large."""
+        return self._replace(inflation=factor**2 * self.inflation)
+
     def misfit(self, later: Evidence) -> float:
         """Return what there is to explain of a later window, as gains are."""
         return misfit_of(self._tempered, tempered(later, self.inflation), self.prior_sigma)
@@ -134,8 +135,7 @@ class Reference(NamedTuple):
 
     phi, torque_offset_nm: (10 n,) and (n,), see `fitted_torques`; all else is of torques without the offsets.
     torque_sigma_nm: (n,) noise of the torques as if samples were independent. information: what the run says
-    of the inertial parameters. imu, drives: None of what is not compared; a joint that hardly moved has no
-    drive. together: see `moved_together`.
+    of the inertial parameters. drives: None of a joint that hardly moved. together: see `moved_together`.
     """
 
     name: str
@@ -147,7 +147,7 @@ class Reference(NamedTuple):
     information: tuple[JointInformation, ...]
     torque: BaselineTest
     imu_model: ImuModel
-    imu: BaselineTest | None
+    imu: BaselineTest
     drive_models: tuple[DriveModel, ...]
     drives: tuple[BaselineTest | None, ...]
     contact: ContactModel
@@ -158,10 +158,9 @@ class Reference(NamedTuple):
         """What the run leaves open, as sentences."""
         if self.together:
             return ()
-        others = "" if self.imu is not None else ", and neither links, IMUs nor friction are monitored"
         return (
-            f"the run that {self.name} is known from hardly moved its joints together: torques are compared "
-            f"{ALONE_FACTOR:.1f} times as coarsely as after a run with --excitation d-optimal{others}",
+            f"the run that {self.name} is known from hardly moved its joints together: torques and IMUs are "
+            f"compared {ALONE_FACTOR:.1f} times as coarsely as after a run with --excitation d-optimal",
         )
 
 
@@ -191,8 +190,7 @@ def build_reference(known: BaselineRobot) -> Reference:
     factor = 1.0 if together else ALONE_FACTOR
     sigma, information, torque = _torque(chain, phi, sessions)
     model = _imu_model(known, types, sessions)
-    compared = together or len(types) <= _ALONE_JOINTS
-    drives = [_drive(kind, sessions, joint, compared) for joint, kind in enumerate(types)]
+    drives = [_drive(kind, sessions, joint) for joint, kind in enumerate(types)]
     outside = [MomentumObserver(chain, phi).advance(b.q_rad, b.qd_rad_s, b.tau_nm) for b in blocks]
     fast = [factor * FastPart().advance(one) for one in outside]
     return Reference(
@@ -203,9 +201,9 @@ def build_reference(known: BaselineRobot) -> Reference:
         torque_offset_nm=offset_nm,
         torque_sigma_nm=sigma,
         information=information,
-        torque=torque._replace(inflation=factor**2 * torque.inflation),
+        torque=torque.coarser(factor),
         imu_model=model,
-        imu=_imu_test(model, sessions) if compared else None,
+        imu=_imu_test(model, sessions).coarser(factor),
         drive_models=tuple(drive for drive, _ in drives),
         drives=tuple(test for _, test in drives),
         contact=contact_model(fast),
@@ -359,9 +357,7 @@ def _imu_test(model: ImuModel, sessions: _Sessions) -> BaselineTest:
     return calibrated_test(evidence, model.prior_sigma, link_changes(model.chain))
 
 
-def _drive(
-    kind: ModuleType, sessions: _Sessions, joint: int, compared: bool
-) -> tuple[DriveModel, BaselineTest | None]:
+def _drive(kind: ModuleType, sessions: _Sessions, joint: int) -> tuple[DriveModel, BaselineTest | None]:
     parts = [drive_rows(kind, one, joint) for one in _stretches(sessions)]
     rows, torque = (np.concatenate(column) for column in zip(*parts, strict=True))
     theta, noise = catalogued_drive(kind), kind.max_effort_nm
@@ -371,8 +367,6 @@ def _drive(
         sigma, counted = noise_level([(torque - rows @ theta)[:, None]])
         noise = float(max(sigma[0], 1e-6) * np.sqrt(counted[0]))
     model = DriveModel(kind, theta, noise)
-    if not compared:
-        return model, None
     windows = [
         [e for one in window if (e := drive_evidence(model, one, joint)) is not None]
         for window in _windows(sessions)

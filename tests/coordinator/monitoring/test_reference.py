@@ -89,7 +89,7 @@ def test_what_a_model_leaves_is_noise_by_which_windows_agree() -> None:
 
 
 def test_a_window_that_cannot_tell_so_small_a_change_inflates_nothing() -> None:
-    """With a sigma of a third it says that a parameter has changed by four, where some hundredths are likely."""
+    """With a sigma of a third it says that a parameter changed by four, where hundredths are likely."""
     odd = evidence_of(3.0 * np.eye(4)[:1], [15.0])
     windows = [*_noisy_windows(0.5), odd]
     assert calibrated_test(windows, np.full(4, 10.0), (SMALL_CHANGE,)).inflation == MARGIN
