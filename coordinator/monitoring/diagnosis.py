@@ -14,17 +14,16 @@ from scipy.special import chdtri
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.contact import Contact
-from coordinator.monitoring.findings import Detection, Kind
-from coordinator.monitoring.likelihood_ratio import Evidence, most_of
+from coordinator.monitoring.findings import Detection
+from coordinator.monitoring.likelihood_ratio import Evidence, joined, most_of
 from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
+    LARGE,
     UNIT_PAYLOAD_KG,
     ImuModel,
     displacement,
     drive_evidence,
-    drive_window,
     imu_evidence,
-    imu_window,
     information_of,
     torque_evidence,
     torque_window,
@@ -46,8 +45,8 @@ LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
 MOVING_RAD_S = 0.02
 # Friction changes by more than that with the weather.
 MIN_FRICTION = 0.1
-# Of the readings of an IMU [mrad/s, m/s^2]: what its biases drift by in an hour.
-MIN_IMU_ERROR: dict[Kind, float] = {"gyro": 3.0, "accelerometer": 0.05}
+# Nor is an IMU's error that is not known to so many: how far biases drift is part of them.
+MIN_IMU_SIGMAS = 3.0
 # A change that is all there is leaves no more of the misfit than chance does in one window of so many.
 ONE_IN = 1e4
 # A mass that is not known to this many standard deviations is not said to be there.
@@ -148,7 +147,7 @@ def _drives(
         parts = _drive_parts(window, joint)
         if known is None or not parts:
             continue
-        later = drive_window(parts)
+        later = joined(parts)
         change = known.find(later)[0]
         scaled = model.relative_friction
         sigma, more = float(np.sqrt(scaled @ change.covariance @ scaled)), float(scaled @ change.size)
@@ -175,24 +174,26 @@ def _drives(
 def _structure(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
 ) -> Detection | None:
-    chain, test = reference.chain, reference.imu
+    chain, links = reference.chain, len(reference.chain.linked)
     # At rest an IMU shows which way is down, by its own errors and in whatever pose, and no length.
-    if not chain.linked or 2 * sum(segment.moved for segment in window) < len(window):
+    if 2 * sum(segment.moved for segment in window) < len(window):
         return None
-    parts = [segment.imu for segment in window]
-    found = test.find(imu_window(reference.imu_model, parts))
-    most = most_of(found)
+    later = joined([segment.imu for segment in window])
+    found = reference.imu.find(later)
+    gain = max((change.gain for change in found[:links]), default=0.0)
+    sensor = imu_error(found[links:], later)
+    if sensor.gain > max(gain + LEAD, thresholds.link):
+        # What explains most, and is not known to be there, is no reason to name anything else.
+        known = sensor.error > MIN_IMU_SIGMAS * sensor.sigma
+        return sensor.detection(chain.serials[sensor.place], thresholds.link) if known else None
+    if gain < thresholds.link:
+        return None
+    most = most_of(found[:links])
     best, child = found[most], chain.linked[most]
-    sensor = imu_error(test, reference.imu_model, parts)
-    if sensor.gain > max(best.gain + LEAD, thresholds.link):
-        large = sensor.error > MIN_IMU_ERROR[sensor.kind] + 3.0 * sensor.sigma
-        return sensor.detection(chain.serials[sensor.place], thresholds.link) if large else None
-    if best.gain < thresholds.link:
-        return None
-    turn, shift = displacement(chain, child, best.size)
-    length = float(np.linalg.norm(shift))
-    slope = np.array([shift / max(length, 1e-9) @ displacement(chain, child, unit)[1] for unit in np.eye(6)])
-    sigma, angle = float(np.sqrt(slope @ best.covariance @ slope)), float(np.linalg.norm(turn))
+    turn, shift = displacement(best.size)
+    length, angle = float(np.linalg.norm(shift)), float(np.linalg.norm(turn))
+    along = LARGE * shift / max(length, 1e-9)
+    sigma = float(np.sqrt(along @ best.covariance[3:, 3:] @ along))
     min_shift, min_turn = (LOADED_SHIFT_M, LOADED_TURN_RAD) if loaded else (MIN_SHIFT_M, MIN_TURN_RAD)
     if length < min_shift + 2.0 * sigma and angle < min_turn:
         return None
@@ -237,7 +238,7 @@ def _torque_sensor(
     known, parts = reference.drives[joint], _drive_parts(window, joint)
     if known is None or not parts:
         return None
-    model, later = reference.drive_models[joint], drive_window(parts)
+    model, later = reference.drive_models[joint], joined(parts)
     offset = drive_offset(known, model, joint, later)
     shown = offset.gain > thresholds.drive and _is_all(offset.gain, known.misfit(later), len(model.theta))
     return found if shown else None
@@ -289,7 +290,7 @@ def unexplained(reference: Reference, thresholds: Thresholds, load: LoadShift) -
     """Return torques that no payload on one body explains."""
     summary = (
         "the torques have changed in a way that no payload on one body explains: something holds the robot, "
-        "several things were added, or a joint's torque sensor is off"
+        "several things were added, a link is displaced, or a joint's torque sensor is off"
     )
     serial = reference.chain.serials[load.carrier]
     return Detection("unexplained", serial, 0.0, 0.0, load.gain, thresholds.payload, summary)

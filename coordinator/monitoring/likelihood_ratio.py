@@ -96,6 +96,8 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
 def without_own(evidence: Evidence, own_sigma: ArrayLike) -> Evidence:
     """Return what is left when the first parameters are this stretch's own, known before to `own_sigma`."""
     sigma = np.asarray(own_sigma, dtype=float)
+    if not sigma.size:
+        return evidence
     own, rest = slice(0, sigma.size), slice(sigma.size, None)
     across = sigma[:, None] * evidence.matrix[own, rest]
     columns = np.column_stack([across, sigma * evidence.vector[own]])
@@ -117,7 +119,11 @@ def tempered(evidence: Evidence, inflation: float) -> Evidence:
 
 
 def find_changes(
-    before: Evidence, later: Evidence, prior_sigma: ArrayLike, changes: Sequence[Array]
+    before: Evidence,
+    later: Evidence,
+    prior_sigma: ArrayLike,
+    changes: Sequence[Array],
+    likely: Sequence[float] | None = None,
 ) -> tuple[Change, ...]:
     """Return the best change of every hypothesis about what changed between two stretches of time.
 
@@ -126,6 +132,8 @@ def find_changes(
         prior_sigma: (p,) how far a parameter may be from there, before anything was measured.
         changes: per hypothesis the matrix (p, d) from its own parameters to the change of theta, in units in
             which a change of 1 is large: there is a prior of that size on them.
+        likely: per hypothesis how large changes are by which it is judged: its gain is that under a prior of
+            this size, its size and covariance are those under a prior of 1; None for 1 of all.
 
     Raises:
         ValueError: evidence about different parameters.
@@ -140,10 +148,10 @@ def find_changes(
     solved = _with_prior(former.matrix + latter.matrix, columns)
     vector = wide.T @ latter.vector - seen.T @ solved[:, -1]
     found, first = [], 0
-    for change in changes:
+    for change, usual in zip(changes, likely or [1.0] * len(changes), strict=True):
         own = slice(first, first + change.shape[1])
         matrix = wide[:, own].T @ seen[:, own] - seen[:, own].T @ solved[:, own]
-        found.append(_best_change(matrix, vector[own]))
+        found.append(_best_change(matrix, vector[own], usual))
         first = own.stop
     return tuple(found)
 
@@ -201,8 +209,12 @@ def _with_prior(matrix: Array, columns: Array) -> Array:
     return np.asarray(cho_solve(factor, columns, check_finite=False))
 
 
-def _best_change(matrix: Array, vector: Array) -> Change:
-    covariance = np.asarray(np.linalg.inv(matrix + np.eye(vector.size)), dtype=np.float64)
+def _best_change(matrix: Array, vector: Array, likely: float) -> Change:
+    unit = np.eye(vector.size)
+    covariance = np.asarray(np.linalg.inv(matrix + unit), dtype=np.float64)
     best: Array = covariance @ vector
+    gain = float(vector @ best)
+    if likely != 1.0:
+        gain = float(vector @ np.linalg.solve(matrix + unit / likely**2, vector))
     make_read_only((best, covariance))
-    return Change(float(vector @ best), best, covariance)
+    return Change(gain, best, covariance)

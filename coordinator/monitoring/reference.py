@@ -27,20 +27,24 @@ from coordinator.monitoring.likelihood_ratio import (
     joined,
     misfit_of,
     tempered,
+    without_own,
 )
 from coordinator.monitoring.momentum_observer import MomentumObserver
 from coordinator.monitoring.residual_tests import (
+    IMU_ERRORS,
+    LARGE,
+    LIKELY,
+    OWN_SIGMA,
     PRIOR_KG,
     DriveModel,
     ImuModel,
     catalogued_drive,
     drive_evidence,
     drive_rows,
-    drive_window,
     fitted_drive,
+    imu_changes,
     imu_evidence,
     imu_noise,
-    imu_window,
     information_of,
     link_changes,
     payload_changes,
@@ -91,6 +95,8 @@ BODY_SIGMA_KG = 0.1
 # The noise of the torques settles in as many rounds.
 _ROUNDS = 3
 _NO_NOISE = 1e-9
+# Of no parameters.
+_NONE = np.zeros(0)
 
 
 # The stretches of half a second of each session of a run.
@@ -102,32 +108,43 @@ class UnsuitableBaseline(UsageError):
 
 
 class BaselineTest(NamedTuple):
-    """Evidence of the known run about one thing.
+    """Evidence of the known run about one thing, and what may have changed later.
 
-    inflation: by how much the variance of noise is larger than it was taken to be, as the model is not exact:
-    all evidence is tempered by it, and priors are not.
+    evidence: about p parameters that stay. own_sigma, prior_sigma: (o,) and (p,) how far those that are each
+    window's own, and those that stay, may be from the model. changes: of all (o + p), see `find_changes`.
+    likely: see there. inflation: by how much the variance of noise is larger than it was taken to be, as the
+    model is not exact: all evidence is tempered by it, `evidence` is already, and priors are not.
     """
 
     evidence: Evidence
+    own_sigma: Array
     prior_sigma: Array
     changes: tuple[Array, ...]
     inflation: float
+    likely: tuple[float, ...] | None = None
 
     def find(self, later: Evidence) -> tuple[Change, ...]:
-        """Test a later window."""
-        return find_changes(self._tempered, tempered(later, self.inflation), self.prior_sigma, self.changes)
-
-    def coarser(self, factor: float) -> "BaselineTest":
-        """Return the test with a noise that is so many times as large."""
-        return self._replace(inflation=factor**2 * self.inflation)
+        """Test the evidence of a later window, about all parameters."""
+        return find_changes(
+            self.before, tempered(later, self.inflation), self.sigma, self.changes, self.likely
+        )
 
     def misfit(self, later: Evidence) -> float:
         """Return what there is to explain of a later window, as gains are."""
-        return misfit_of(self._tempered, tempered(later, self.inflation), self.prior_sigma)
+        return misfit_of(self.before, tempered(later, self.inflation), self.sigma)
 
     @property
-    def _tempered(self) -> Evidence:
-        return tempered(self.evidence, self.inflation)
+    def before(self) -> Evidence:
+        """What the run says of all parameters: nothing of those that are a later window's own."""
+        own, size = self.own_sigma.size, self.own_sigma.size + self.prior_sigma.size
+        matrix, vector = np.zeros((size, size)), np.zeros(size)
+        matrix[own:, own:], vector[own:] = self.evidence.matrix, self.evidence.vector
+        return Evidence(matrix, vector)
+
+    @property
+    def sigma(self) -> Array:
+        """How far all parameters may be from the model, (o + p,)."""
+        return np.concatenate([self.own_sigma, self.prior_sigma])
 
 
 class Reference(NamedTuple):
@@ -188,7 +205,7 @@ def build_reference(known: BaselineRobot) -> Reference:
         )
     together = moved_together(recording.motions("dynamic"), len(types))
     factor = 1.0 if together else ALONE_FACTOR
-    sigma, information, torque = _torque(chain, phi, sessions)
+    sigma, information, torque = _torque(chain, phi, sessions, factor)
     model = _imu_model(known, types, sessions)
     drives = [_drive(kind, sessions, joint) for joint, kind in enumerate(types)]
     outside = [MomentumObserver(chain, phi).advance(b.q_rad, b.qd_rad_s, b.tau_nm) for b in blocks]
@@ -201,9 +218,9 @@ def build_reference(known: BaselineRobot) -> Reference:
         torque_offset_nm=offset_nm,
         torque_sigma_nm=sigma,
         information=information,
-        torque=torque.coarser(factor),
+        torque=torque,
         imu_model=model,
-        imu=_imu_test(model, sessions).coarser(factor),
+        imu=_imu_test(model, sessions, factor),
         drive_models=tuple(drive for drive, _ in drives),
         drives=tuple(test for _, test in drives),
         contact=contact_model(fast),
@@ -320,7 +337,7 @@ def _most_probable(
 
 
 def _torque(
-    chain: Chain, phi: Array, sessions: _Sessions
+    chain: Chain, phi: Array, sessions: _Sessions, factor: float
 ) -> tuple[Array, tuple[JointInformation, ...], BaselineTest]:
     sigma, counted = noise_level([torque_residual(chain, phi, one) for one in _stretches(sessions)])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
@@ -328,7 +345,9 @@ def _torque(
         torque_window([torque_evidence(chain, phi, independent, one) for one in window])
         for window in _windows(sessions)
     ]
-    test = calibrated_test(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
+    test = calibrated_test(
+        evidence, _NONE, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)), factor=factor
+    )
     whole = merge(*(information_of(chain, one) for window in _windows(sessions) for one in window))
     return independent, whole, test
 
@@ -350,11 +369,13 @@ def _imu_model(known: BaselineRobot, types: tuple[ModuleType, ...], sessions: _S
     return rough._replace(sigma=imu_noise(rough, _stretches(sessions)))
 
 
-def _imu_test(model: ImuModel, sessions: _Sessions) -> BaselineTest:
-    evidence = [
-        imu_window(model, [imu_evidence(model, one) for one in window]) for window in _windows(sessions)
-    ]
-    return calibrated_test(evidence, model.prior_sigma, link_changes(model.chain))
+def _imu_test(model: ImuModel, sessions: _Sessions, factor: float) -> BaselineTest:
+    """Return the test of links, then of gyros, then of accelerometers."""
+    evidence = [joined([imu_evidence(model, one) for one in window]) for window in _windows(sessions)]
+    count, links = len(model.chain.serials), link_changes(model.chain)
+    sensors = [one for sensor in IMU_ERRORS for one in imu_changes(count, sensor)]
+    likely = (*[LIKELY / LARGE] * len(links), *[1.0] * len(sensors))
+    return calibrated_test(evidence, model.own_sigma, model.prior_sigma, (*links, *sensors), likely, factor)
 
 
 def _drive(kind: ModuleType, sessions: _Sessions, joint: int) -> tuple[DriveModel, BaselineTest | None]:
@@ -371,24 +392,37 @@ def _drive(kind: ModuleType, sessions: _Sessions, joint: int) -> tuple[DriveMode
         [e for one in window if (e := drive_evidence(model, one, joint)) is not None]
         for window in _windows(sessions)
     ]
-    evidence = [drive_window(window) for window in windows if window]
+    evidence = [joined(window) for window in windows if window]
     known = len(evidence) >= MIN_WINDOWS
-    return model, calibrated_test(evidence, model.prior_sigma, (model.change,)) if known else None
+    return model, calibrated_test(evidence, OWN_SIGMA, model.prior_sigma, (model.change,)) if known else None
 
 
 def calibrated_test(
-    windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array, ...]
+    windows: Sequence[Evidence],
+    own_sigma: Array,
+    prior_sigma: Array,
+    changes: tuple[Array, ...],
+    likely: tuple[float, ...] | None = None,
+    factor: float = 1.0,
 ) -> BaselineTest:
-    """Return what all windows say, inflated so that each agrees with the others, and by a margin more."""
+    """Return what all windows say, with noise inflated until each agrees with the others, and by a margin.
+
+    factor: by how much more the noise is, see `ALONE_FACTOR`. Else as `BaselineTest`.
+    """
     # The median of the largest gain that chance makes in as many tests.
     expected = [chdtri(change.shape[1], 0.5 / (len(windows) * len(changes))) for change in changes]
-    others = [joined([*windows[:k], *windows[k + 1 :]]) for k in range(len(windows))]
+
+    def parts(inflation: float) -> list[Evidence]:
+        return [without_own(tempered(window, inflation), own_sigma) for window in windows]
 
     def excess(log_inflation: float) -> float:
         """Return the logarithm of the largest gain over what chance makes."""
         inflation, largest = float(np.exp(log_inflation)), 0.0
-        for other, window in zip(others, windows, strict=True):
-            test = BaselineTest(other, prior_sigma, changes, inflation)
+        each = parts(inflation)
+        whole = joined(each)
+        for part, window in zip(each, windows, strict=True):
+            others = Evidence(whole.matrix - part.matrix, whole.vector - part.vector)
+            test = BaselineTest(others, own_sigma, prior_sigma, changes, inflation, likely)
             gains = [change.gain / level for change, level in zip(test.find(window), expected, strict=True)]
             largest = max([largest, *gains])
         return float(np.log(max(largest, _NO_NOISE)))
@@ -399,7 +433,8 @@ def calibrated_test(
         while excess(upper) > 0.0:
             lower, upper = upper, 2.0 * upper
         exact = brentq(excess, lower, upper, xtol=0.01)
-    return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * float(np.exp(exact)))
+    inflation = MARGIN * factor**2 * float(np.exp(exact))
+    return BaselineTest(joined(parts(inflation)), own_sigma, prior_sigma, changes, inflation, likely)
 
 
 def _windows(sessions: _Sessions) -> list[Sequence[DataSegment]]:

@@ -38,13 +38,14 @@ from coordinator.batch_estimation.imu_prediction import (
 )
 from coordinator.batch_estimation.link_compliance import estimated_turns
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, without_first, without_own
+from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, without_first
 from coordinator.monitoring.segments import DataSegment, noise_level
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.information import JointInformation, gather
+from module_agent.model.perturbation import skew
 from module_agent.model.read_only import make_read_only, read_only
 from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regressor
 from module_agent.signals.filtering import differentiate
@@ -124,9 +125,15 @@ _OWN_SIGMA = np.array([3e-3] * 3 + [0.05] * 3 + [5e-3])
 # Of what links' giving way makes of readings: how much of it is uncertain, and by how much later or earlier
 # it may come. An arm that rings at 12 Hz bends by as much as expected, but 12 ms later.
 _GIVING_SHARE, _GIVING_LATE_S = 0.1, 0.01
-# Of a change, in radians and metres. A stretch that cannot tell so little says nothing: a wrist that swings
-# alone shakes the arm by less than a count of its encoders, which half a metre of displacement would explain.
-LARGE = 5e-3
+# Of a link's change, in radians and metres: as it is measured, and as it is judged. A stretch that cannot
+# tell 5 mm says nothing: a wrist that swings alone shakes the arm by less than a count of its encoders, which
+# half a metre of displacement would explain.
+LARGE, LIKELY = 0.1, 5e-3
+# How large a change of 1 is of biases [rad/s, m/s^2] and scales of a sensor of three axes.
+IMU_SIZES: dict[ImuSensor, Array] = {
+    "gyro": np.repeat([0.1, 0.1], 3),
+    "accelerometer": np.repeat([1.0, 0.1], 3),
+}
 
 
 class ImuModel(NamedTuple):
@@ -245,11 +252,6 @@ def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
     return Evidence(matrix, vector)
 
 
-def imu_window(model: ImuModel, parts: Sequence[Evidence]) -> Evidence:
-    """Return the evidence about what stays of a window's stretches together."""
-    return without_own(joined(parts), model.own_sigma)
-
-
 def imu_error_columns(count: int, sensor: ImuSensor) -> list[Array]:
     """Return per module the columns (6,) of `imu_evidence` that its sensor's biases and scales are in."""
     bias, scale = IMU_ERRORS[sensor]
@@ -265,23 +267,41 @@ def imu_error_columns(count: int, sensor: ImuSensor) -> list[Array]:
 
 
 def link_changes(chain: Chain) -> tuple[Array, ...]:
-    """Return the hypotheses, one for every module but those on the base: all beyond its link is displaced."""
+    """Return the hypotheses, one for every module but those on the base: all beyond its link is displaced.
+
+    By a turn and a shift (6,) of the module's IMU in the root frame at q = 0, in units of `LARGE`.
+    """
     count = len(chain.serials)
-    total = _PER_TWIST * count + 3 + len(_LASTING) * count
-    found = np.zeros((len(chain.linked), total, _PER_TWIST))
+    found = np.zeros((len(chain.linked), _imu_parameters(count), _PER_TWIST))
     for change, child in zip(found, chain.linked, strict=True):
+        # A shift s of the IMU's place p, turned by w, is one of the origin by s - w x p.
+        about_imu = np.eye(_PER_TWIST)
+        about_imu[3:, :3] = skew(chain.imu_home[child, :3, 3])
         for module in chain.descendants(child):
-            change[_PER_TWIST * module : _PER_TWIST * (module + 1)] = LARGE * np.eye(_PER_TWIST)
+            first = len(_OWN) * count + _PER_TWIST * module
+            change[first : first + _PER_TWIST] = LARGE * about_imu
     return tuple(found)
 
 
-def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:
-    """Return the turn (3,) [rad] and the displacement (3,) [m] of a module's IMU, in the root frame at q = 0.
+def imu_changes(count: int, sensor: ImuSensor) -> tuple[Array, ...]:
+    """Return the hypotheses, one for every module: its gyro's or accelerometer's biases and scales change."""
+    found = np.zeros((count, _imu_parameters(count), len(IMU_SIZES[sensor])))
+    for change, columns in zip(found, imu_error_columns(count, sensor), strict=True):
+        change[columns, np.arange(len(columns))] = IMU_SIZES[sensor]
+    return tuple(found)
 
-    size: (6,) of `Change`.
+
+def displacement(size: Array) -> tuple[Array, Array]:
+    """Return the turn (3,) [rad] and the shift (3,) [m] of a module's IMU, in the root frame at q = 0.
+
+    size: (6,) of a `Change` by `link_changes`.
     """
-    turn, shift = LARGE * size[:3], LARGE * size[3:]
-    return turn, shift + np.cross(turn, chain.imu_home[child, :3, 3])
+    return LARGE * size[:3], LARGE * size[3:]
+
+
+def _imu_parameters(count: int) -> int:
+    """Return how many parameters `imu_evidence` of n modules is about."""
+    return (len(_OWN) + _PER_TWIST + len(_LASTING)) * count + 3
 
 
 # c, l, Fc, Fv, J, T, offset: Fc and Fv are what changes.
@@ -315,14 +335,14 @@ class DriveModel(NamedTuple):
     @property
     def change(self) -> Array:
         """The hypothesis: Coulomb and viscous friction change, by as much as the catalogue has them."""
-        found = np.zeros((TERMS, 2))
-        found[_FRICTION] = np.diag(catalogued_drive(self.kind)[_FRICTION])
+        found = np.zeros((OWN_SIGMA.size + TERMS, 2))
+        found[OWN_SIGMA.size :][_FRICTION] = np.diag(catalogued_drive(self.kind)[_FRICTION])
         return found
 
     @property
     def offset_change(self) -> Array:
         """The rival hypothesis: the torque sensor's offset changes; in units of a twentieth of its range."""
-        found = np.zeros((TERMS, 1))
+        found = np.zeros((OWN_SIGMA.size + TERMS, 1))
         found[-1] = 0.05 * self.kind.max_effort_nm
         return found
 
@@ -362,11 +382,6 @@ def drive_evidence(model: DriveModel, segment: DataSegment, joint: int) -> Evide
         return None
     weighted = np.column_stack([rows[:, : OWN_SIGMA.size], rows]) / model.sigma_nm
     return evidence_of(weighted, (torque - rows @ model.theta) / model.sigma_nm)
-
-
-def drive_window(parts: Sequence[Evidence]) -> Evidence:
-    """Return the evidence about the seven parameters of a window's stretches together."""
-    return without_own(joined(parts), OWN_SIGMA)
 
 
 def fitted_drive(kind: ModuleType, rows: Array, torque_nm: Array) -> Array:

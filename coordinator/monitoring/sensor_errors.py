@@ -6,9 +6,8 @@ all IMUs beyond it by how its joints turn: only one sensor's error is its own al
 same likelihood ratio, with fewer parameters or as many. Where a sensor explains no more than a link or a
 payload, nothing tells them apart, and what happens more often is named: the link or the payload.
 
-An IMU whose biases are other than they drift (`ImuModel.own_sigma`) is named whatever else there is: how far
-biases drift is known before, so that errors of the arm's model, by which all evidence counts for less, do not
-widen it.
+A gyro or an accelerometer is named also where it passes for nothing else: how far temperature makes biases
+drift is known before (`ImuModel.own_sigma`).
 
 The offset of a torque sensor shows in its drive as well, whose motor does not know of it; where a joint turns
 one way more often than the other it passes for friction, now for more and now for less.
@@ -26,9 +25,10 @@ from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, mo
 from coordinator.monitoring.reference import BaselineTest
 from coordinator.monitoring.residual_tests import (
     IMU_ERRORS,
+    IMU_SIZES,
     SENSOR_ERRORS,
     DriveModel,
-    ImuModel,
+    ImuSensor,
     imu_error_columns,
 )
 from module_agent.model.chain import Array
@@ -36,10 +36,8 @@ from module_agent.model.chain import Array
 # By so much more [variances] than a payload or a link a sensor has to explain: chance makes as much of its
 # own parameters once in a thousand windows.
 LEAD = 22.0
-# How large a change of 1 is: of a torque sensor's offset [Nm] and scale; of biases [rad/s, m/s^2] and scales
-# of a sensor of three axes.
+# How large a change of 1 is of a torque sensor's offset [Nm] and scale.
 _TORQUE_SIZES = np.array([1.0, 0.3])
-_IMU_SIZES = {"gyro": np.repeat([0.1, 0.1], 3), "accelerometer": np.repeat([1.0, 0.1], 3)}
 # What the model has no error of to begin with is where it was.
 _FIXED = 1e-9
 _MIN_WEIGHT = 1e-12
@@ -72,13 +70,16 @@ def torque_sensor_error(test: BaselineTest, parts: Sequence[Evidence]) -> Sensor
     count = later.parameters - test.evidence.parameters
     joints = count // SENSOR_ERRORS
     columns = [np.array([joint, joints + joint]) for joint in range(joints)]
-    changes = _changes(later, test, np.full(count, _FIXED), columns, _TORQUE_SIZES)
+    hypotheses = np.zeros((joints, later.parameters, SENSOR_ERRORS))
+    for change, own in zip(hypotheses, columns, strict=True):
+        change[own, np.arange(SENSOR_ERRORS)] = _TORQUE_SIZES
+    changes = test._replace(own_sigma=np.full(count, _FIXED), changes=tuple(hypotheses)).find(later)
     index = most_of(changes)
     return _sensor_error("torque-sensor", index, changes[index], later, columns[index], _TORQUE_SIZES)
 
 
 def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evidence) -> SensorError:
-    """Return what an offset of a joint's torque sensor explains of its drive's evidence (`drive_window`)."""
+    """Return what an offset of a joint's torque sensor explains of its drive (`drive_evidence`)."""
     change = test._replace(changes=(model.offset_change,)).find(later)[0]
     # The hypothesis has one parameter, which moves the offset alone.
     unit_nm = float(model.offset_change.max())
@@ -86,36 +87,18 @@ def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evide
     return SensorError("torque-sensor", joint, change.gain, unit_nm * error, unit_nm * sigma)
 
 
-def imu_error(test: BaselineTest, model: ImuModel, parts: Sequence[Evidence]) -> SensorError:
-    """Return the gyro or accelerometer that explains most of a window's evidence (`imu_evidence`)."""
-    later, best = joined(parts), []
-    for kind in IMU_ERRORS:
-        sizes = _IMU_SIZES[kind]
-        columns = imu_error_columns(len(model.chain.serials), kind)
-        changes = _changes(later, test, model.own_sigma, columns, sizes)
-        index = most_of(changes)
-        best.append(_sensor_error(kind, index, changes[index], later, columns[index], sizes))
-    return max(best, key=lambda one: one.gain)
+def imu_error(changes: Sequence[Change], later: Evidence) -> SensorError:
+    """Return the gyro or accelerometer that explains most of a window.
 
-
-def _changes(
-    later: Evidence, test: BaselineTest, own_sigma: Array, columns: Sequence[Array], sizes: Array
-) -> tuple[Change, ...]:
-    """Return the best change of every sensor, whose errors are in some columns, as `BaselineTest.find`."""
-    own = own_sigma.size
-    matrix, vector = np.zeros_like(later.matrix), np.zeros_like(later.vector)
-    matrix[own:, own:], vector[own:] = test.evidence.matrix, test.evidence.vector
-    hypotheses = []
-    for one in columns:
-        change = np.zeros((later.parameters, len(one)))
-        change[one, np.arange(len(one))] = sizes
-        hypotheses.append(change)
-    whole = test._replace(
-        evidence=Evidence(matrix, vector),
-        prior_sigma=np.concatenate([own_sigma, test.prior_sigma]),
-        changes=tuple(hypotheses),
-    )
-    return whole.find(later)
+    Args:
+        changes: of the gyros, then of the accelerometers, as `Reference.imu` finds them.
+        later: the window's evidence (`imu_evidence`).
+    """
+    place = most_of(changes)
+    kind: ImuSensor = list(IMU_ERRORS)[place // (count := len(changes) // len(IMU_ERRORS))]
+    index = place % count
+    columns = imu_error_columns(count, kind)[index]
+    return _sensor_error(kind, index, changes[place], later, columns, IMU_SIZES[kind])
 
 
 def _sensor_error(

@@ -68,6 +68,7 @@ def test_a_session_spans_its_first_step_to_the_last_that_was_done() -> None:
 # Of four parameters the first two may change: by any size, or by some hundredths.
 CHANGE = np.eye(4)[:, :2]
 SMALL_CHANGE = 0.05 * CHANGE
+NONE = np.zeros(0)
 
 
 def _noisy_windows(noise: float, rows: int = 60) -> list[Evidence]:
@@ -83,8 +84,8 @@ def _noisy_windows(noise: float, rows: int = 60) -> list[Evidence]:
 def test_what_a_model_leaves_is_noise_by_which_windows_agree() -> None:
     """Chance sets the largest of twenty gains, within a factor of two nearly always."""
     wide = np.full(4, 10.0)
-    assert calibrated_test(_noisy_windows(0.5), wide, (CHANGE,)).inflation == MARGIN
-    inflation = calibrated_test(_noisy_windows(5.0), wide, (CHANGE,)).inflation
+    assert calibrated_test(_noisy_windows(0.5), NONE, wide, (CHANGE,)).inflation == MARGIN
+    inflation = calibrated_test(_noisy_windows(5.0), NONE, wide, (CHANGE,)).inflation
     assert inflation == pytest.approx(25.0 * MARGIN, rel=0.5)
 
 
@@ -92,9 +93,9 @@ def test_a_window_that_cannot_tell_so_small_a_change_inflates_nothing() -> None:
     """With a sigma of a third it says that a parameter changed by four, where hundredths are likely."""
     odd = evidence_of(3.0 * np.eye(4)[:1], [15.0])
     windows = [*_noisy_windows(0.5), odd]
-    assert calibrated_test(windows, np.full(4, 10.0), (SMALL_CHANGE,)).inflation == MARGIN
+    assert calibrated_test(windows, NONE, np.full(4, 10.0), (SMALL_CHANGE,)).inflation == MARGIN
     # Were a change of any size as likely, all windows would count for less.
-    assert calibrated_test(windows, np.full(4, 10.0), (10.0 * CHANGE,)).inflation > 10.0 * MARGIN
+    assert calibrated_test(windows, NONE, np.full(4, 10.0), (10.0 * CHANGE,)).inflation > 10.0 * MARGIN
 
 
 # What sensors of the first joint, which carries all, and of the last read of nothing [Nm].

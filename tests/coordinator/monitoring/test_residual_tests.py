@@ -2,21 +2,25 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import estimated_turns
-from coordinator.monitoring.likelihood_ratio import Change, find_changes, joined
+from coordinator.monitoring.likelihood_ratio import Change, joined, most_of, without_own
+from coordinator.monitoring.reference import BaselineTest
 from coordinator.monitoring.residual_tests import (
+    LARGE,
+    LIKELY,
+    OWN_SIGMA,
     DriveModel,
     ImuModel,
     catalogued_drive,
+    displacement,
     drive_evidence,
     drive_rows,
-    drive_window,
     fitted_drive,
     imu_evidence,
     imu_noise,
-    imu_window,
     link_changes,
 )
 from coordinator.monitoring.segments import DataSegment
@@ -96,8 +100,10 @@ def change_of(before: list[DataSegment], later: DataSegment) -> tuple[Change, fl
     """Return the change of friction that a stretch shows, and by how much of itself it is more."""
     model = known_from(before)
     evidence = [drive_evidence(model, one, JOINT) for one in [*before, later]]
-    *known, last = [drive_window([one]) for one in evidence if one is not None]
-    change = find_changes(joined(known), last, model.prior_sigma, (model.change,))[0]
+    *known, last = [one for one in evidence if one is not None]
+    usual = joined([without_own(one, OWN_SIGMA) for one in known])
+    test = BaselineTest(usual, OWN_SIGMA, model.prior_sigma, (model.change,), inflation=1.0)
+    change = test.find(last)[0]
     return change, float(change.size @ model.relative_friction)
 
 
@@ -164,10 +170,18 @@ def jolted(
     )
 
 
+def link_test(model: ImuModel, before: list[DataSegment], likely: float = LIKELY) -> BaselineTest:
+    """Return the test of links against what a robot did before."""
+    known = without_own(joined([imu_evidence(model, one) for one in before]), model.own_sigma)
+    links = link_changes(model.chain)
+    usual = (likely / LARGE,) * len(links)
+    return BaselineTest(known, model.own_sigma, model.prior_sigma, links, 1.0, usual)
+
+
 def link_gains(model: ImuModel, before: list[DataSegment], later: list[DataSegment]) -> list[float]:
     """Return how much a displacement of each link explains."""
-    known, seen = (imu_window(model, [imu_evidence(model, one) for one in part]) for part in (before, later))
-    return [one.gain for one in find_changes(known, seen, model.prior_sigma, link_changes(model.chain))]
+    seen = joined([imu_evidence(model, one) for one in later])
+    return [one.gain for one in link_test(model, before).find(seen)]
 
 
 def test_links_that_give_way_to_a_jolt_are_not_displaced() -> None:
@@ -185,9 +199,44 @@ def test_a_displaced_link_is_seen_in_a_jolt() -> None:
         imu_home=np.stack([CHAIN.imu_home[0], shift @ CHAIN.imu_home[1], shift @ CHAIN.imu_home[2]]),
     )
     known = [jolted(seed) for seed in range(20)]
-    gains = link_gains(GIVING, known, [jolted(seed, moved=moved) for seed in range(20, 30)])
-    assert max(gains) > ALARM
-    assert CHAIN.linked[int(np.argmax(gains))] == 1
+    later = joined([imu_evidence(GIVING, jolted(seed, moved=moved)) for seed in range(20, 30)])
+    found = link_test(GIVING, known).find(later)
+    best = most_of(found)
+    assert found[best].gain > ALARM
+    assert CHAIN.linked[best] == 1
+    # Along the axis of the joint below nothing tells where it is.
+    assert displacement(found[best].size)[1][:2] == pytest.approx([0.006, 0.008], abs=1e-3)
+
+
+@pytest.mark.parametrize("axis", range(2))
+def test_a_link_that_turns_is_measured_at_its_imu(axis: int) -> None:
+    """By 30 mrad about the place of the IMU beyond it, six times what is likely: it is not made smaller.
+
+    A turn about the axis of the joint below, the third, is a turn of that joint.
+    """
+    turn = 0.03 * np.eye(3)[axis]
+    place = CHAIN.imu_home[1, :3, 3]
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    pose[:3, 3] = place - pose[:3, :3] @ place
+    moved = CHAIN._replace(
+        axis=np.stack([CHAIN.axis[0], *(pose[:3, :3] @ CHAIN.axis[k] for k in (1, 2))]),
+        point=np.stack([CHAIN.point[0], *(pose[:3, :3] @ CHAIN.point[k] + pose[:3, 3] for k in (1, 2))]),
+        imu_home=np.stack([CHAIN.imu_home[0], *(pose @ CHAIN.imu_home[k] for k in (1, 2))]),
+    )
+    later = []
+    for one in segments(8, 10):
+        joints = one.q_rad, one.qd_rad_s, one.qdd_rad_s2
+        before, after = (readings_on(chain, body_motions(chain, *joints)) for chain in (CHAIN, moved))
+        gyro = one.gyro_rad_s + after.gyro_rad_s - before.gyro_rad_s
+        accel = one.accel_m_s2 + after.accel_m_s2 - before.accel_m_s2
+        later.append(imu_evidence(MODEL, one._replace(gyro_rad_s=gyro, accel_m_s2=accel)))
+    found = link_test(MODEL, segments(1, 60)).find(joined(later))[0]
+    turned, shifted = displacement(found.size)
+    sigma = LARGE * np.sqrt(np.diag(found.covariance))
+    assert found.gain > ALARM
+    assert np.all(np.abs(turned - turn) < 4.0 * sigma[:3] + 1e-3)
+    assert np.all(np.abs(shifted) < 4.0 * sigma[3:] + 1e-3)
 
 
 def test_the_noise_of_imus_is_not_what_jolts_leave_of_them() -> None:
@@ -213,9 +262,7 @@ def test_an_arm_that_hardly_moves_has_no_link_displaced_by_half_a_metre() -> Non
         noise = rng.normal(size=(2, SAMPLES, JOINTS, 3))
         gyro, accel = seen.gyro_rad_s + GYRO_SIGMA * noise[0], seen.accel_m_s2 + ACCEL_SIGMA * noise[1]
         shaken.append(any_one._replace(gyro_rad_s=gyro, accel_m_s2=accel))
-    evidence = [[imu_evidence(MODEL, one) for one in part] for part in (segments(1, 40), shaken)]
-    known, later = (imu_window(MODEL, part) for part in evidence)
+    later = joined([imu_evidence(MODEL, one) for one in shaken])
     # Of any size, a displacement explains it.
-    large = [20.0 * change for change in link_changes(CHAIN)]
-    assert max(one.gain for one in find_changes(known, later, MODEL.prior_sigma, large)) > ALARM
-    assert max(link_gains(MODEL, segments(1, 40), shaken)) < ALARM
+    assert max(one.gain for one in link_test(MODEL, segments(1, 40), LARGE).find(later)) > ALARM
+    assert max(one.gain for one in link_test(MODEL, segments(1, 40)).find(later)) < ALARM
