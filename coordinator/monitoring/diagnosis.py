@@ -95,8 +95,8 @@ class LoadShift(NamedTuple):
 
 
 class Diagnosis(NamedTuple):
-    """What a window shows; None of what has not changed. structure: a displaced link, or the IMU that seems
-    to be on one."""
+    """What a window shows; None of what has not changed. structure: a displaced link, or an IMU that reads
+    other than it did."""
 
     drives: tuple[Detection, ...]
     structure: Detection | None

@@ -86,8 +86,9 @@ MIN_WINDOWS = 4
 # A robot does other motions later than those that it is known from, and the model is wrong about them in
 # other ways: without this, an arm of six joints that had not changed was said to have a link displaced.
 MARGIN = 3.0
-# A robot whose joints moved one at a time has not shown how their torques add up. By so much larger are the
-# errors of its model when all move: with `MARGIN` of contacts, 2.2 times at most in eight arms of six joints.
+# A robot whose joints moved one at a time has not shown how their torques add up, nor how its IMUs move when
+# all joints do. By so much larger are the errors of its model then: with `MARGIN`, those of contacts were 2.2
+# times at most in eight arms of six joints, and one arm in six had IMUs that passed for a displaced link.
 ALONE_FACTOR = 2.5
 # Standard deviation of a catalogued body, per `parameter_scale` about its centre of mass: what brackets,
 # cables and a tool add.

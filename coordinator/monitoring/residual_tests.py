@@ -2,11 +2,14 @@
 
 What IMUs say of a link that has changed: rates and specific forces against those of the joints' motion.
 
-A payload changes nothing in them, as encoders sit beyond the springs, but for what links give way under
-their loads, as the known run tells (`estimated_turns`): joints that are caught with a jolt ring on their
-springs, and tubes of 325 mm then shake what they carry by 1 m/s^2. A link that is displaced moves every
-module beyond it by the same twist, linear in the readings as long as it is small (`inertial_slopes`).
-Biases and delays are each stretch's own: they drift, and clocks are mapped anew every day.
+A payload changes nothing in them, as encoders sit beyond the springs, but for the deflection of links. That
+is predicted by the compliance that the known run tells and the modules' own masses (`estimated_turns`):
+joints that are caught with a jolt ring on their springs, and tubes of 325 mm then shake what they carry by
+1 m/s^2. By what the prediction is uncertain each sample is noisier, although that lasts as long as the jolt,
+and a payload makes it worse: the inflation of the test has to cover both.
+A link that is displaced moves every module beyond it by the same twist, linear in the readings as long as it
+is small (`imu_jacobian`). Biases and delays are each stretch's own: they drift, and clocks are mapped anew
+every day.
 
 What motor currents say of a drive's friction: the motor's torque against the spring's.
 
