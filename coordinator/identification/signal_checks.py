@@ -277,7 +277,8 @@ def _jumps(serial: str, rows: Rows) -> Iterable[Finding]:
     step, gap = np.diff(q), np.diff(t_ns)
     apart = np.minimum(np.abs(step[1:-1] - step[:-2]), np.abs(step[1:-1] - step[2:]))
     # A step that is slower or faster than the one before and the one after; a hole in the rows is none.
-    alone = (step[1:-1] - step[:-2]) * (step[1:-1] - step[2:]) > 0.0
+    # By signs: the product of what a damaged row holds may be no number.
+    alone = np.sign(step[1:-1] - step[:-2]) * np.sign(step[1:-1] - step[2:]) > 0.0
     whole = np.abs(gap[1:-1]) < LONG_TICKS * np.median(gap)
     size = np.where(alone & whole, apart, 0.0)
     worst = int(size.argmax())

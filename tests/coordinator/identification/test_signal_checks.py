@@ -107,6 +107,14 @@ def test_a_jump_of_an_encoder_is_named_and_a_hole_in_its_rows_is_not() -> None:
     assert [list(_jumps("A", one)) for one in (rows(), with_hole)] == [[], []]
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_position_that_no_robot_has_is_a_jump() -> None:
+    """A row that was damaged on its way: its square is larger than numbers are."""
+    damaged = rows()
+    damaged["position_rad"][1000] = 0.5 * np.finfo(damaged["position_rad"].dtype).max
+    assert [one.kind for one in _jumps("A", damaged)] == ["encoder_jump"]
+
+
 def trips(offset_ns: Any, seconds: int = 20) -> list[RoundTrip]:
     """Twice a second; the session's clock exceeds the module's by `offset_ns(session time)`."""
     at = [500_000_000 * k for k in range(2 * seconds)]
