@@ -1,5 +1,7 @@
 """Minutes of everyday use under the monitor: a change is named, a seed repeats, a canary sings."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,29 @@ def test_a_sensor_that_goes_off_is_named_on_its_module_and_nothing_else_is_in_th
     )
     assert sick.outcome == "rightly", sick.said
     assert {one.kind for one in sick.rightly} == {kind}
+
+
+ONE_MODULE = """
+name = "one"
+network = "lan"
+[base]
+mount = "floor"
+[[module]]
+serial = "only"
+type = "X5-4"
+parent = "base"
+payload = { mass_kg = 0.3, com_xyz_m = [0.1, 0.0, 0.05] }
+"""
+
+
+def test_a_robot_of_one_module_has_no_link_and_yet_a_gyro_that_is_watched(tmp_path: Path) -> None:
+    robot = tmp_path / "one.toml"
+    robot.write_text(ONE_MODULE)
+    plan = PLAN._replace(robot=str(robot), noise="x5-uncalibrated")
+    sick = monitored_life(plan._replace(change="gyro-bias", day=1, for_s=45.0, from_s=12.0, over_s=10.0))
+    assert sick.outcome == "rightly", sick.said
+    assert {(one.kind, one.serial) for one in sick.rightly} == {("gyro", "only")}
+    assert not monitored_life(plan).said
 
 
 def test_a_seed_repeats_a_life_and_another_day_is_another_life() -> None:
