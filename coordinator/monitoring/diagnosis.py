@@ -183,7 +183,7 @@ def _structure(
     gain = max((change.gain for change in found[:links]), default=0.0)
     sensor = imu_error(found[links:], later)
     if sensor.gain > max(gain + LEAD, thresholds.link):
-        # What explains most, and is not known to be there, is no reason to name anything else.
+        # An error that explains most and is hardly known itself rules out the link, and is not named.
         known = sensor.error > MIN_IMU_SIGMAS * sensor.sigma
         return sensor.detection(chain.serials[sensor.place], thresholds.link) if known else None
     if gain < thresholds.link:

@@ -94,11 +94,11 @@ def imu_error(changes: Sequence[Change], later: Evidence) -> SensorError:
         changes: of the gyros, then of the accelerometers, as `Reference.imu` finds them.
         later: the window's evidence (`imu_evidence`).
     """
-    place = most_of(changes)
-    kind: ImuSensor = list(IMU_ERRORS)[place // (count := len(changes) // len(IMU_ERRORS))]
-    index = place % count
-    columns = imu_error_columns(count, kind)[index]
-    return _sensor_error(kind, index, changes[place], later, columns, IMU_SIZES[kind])
+    count, best = len(changes) // len(IMU_ERRORS), most_of(changes)
+    sensors: list[ImuSensor] = list(IMU_ERRORS)
+    kind, place = sensors[best // count], best % count
+    columns = imu_error_columns(count, kind)[place]
+    return _sensor_error(kind, place, changes[best], later, columns, IMU_SIZES[kind])
 
 
 def _sensor_error(
