@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of
+from coordinator.monitoring.likelihood_ratio import Evidence, evidence_of, joined, tempered, without_own
 from coordinator.monitoring.reference import (
     MARGIN,
     calibrated_test,
@@ -87,6 +87,15 @@ def test_what_a_model_leaves_is_noise_by_which_windows_agree() -> None:
     assert calibrated_test(_noisy_windows(0.5), NONE, wide, (CHANGE,)).inflation == MARGIN
     inflation = calibrated_test(_noisy_windows(5.0), NONE, wide, (CHANGE,)).inflation
     assert inflation == pytest.approx(25.0 * MARGIN, rel=0.5)
+
+
+def test_what_is_a_windows_own_drifts_no_farther_for_noise_that_is_inflated() -> None:
+    """Of an own parameter that is known to 0.01, five times the noise takes nothing."""
+    own = np.array([0.01])
+    found = calibrated_test(_noisy_windows(5.0), own, np.full(3, 10.0), (CHANGE[:, 1:],))
+    parts = [without_own(tempered(one, found.inflation), own) for one in _noisy_windows(5.0)]
+    np.testing.assert_allclose(found.evidence.matrix, joined(parts).matrix, rtol=1e-9)
+    np.testing.assert_allclose(found.evidence.vector, joined(parts).vector, rtol=1e-9, atol=1e-9)
 
 
 def test_a_window_that_cannot_tell_so_small_a_change_inflates_nothing() -> None:
