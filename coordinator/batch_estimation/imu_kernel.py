@@ -1,5 +1,5 @@
-"""The arithmetic of IMU readings and of their derivatives, compiled; `imu_prediction` and `imu_jacobian` say
-what it computes.
+"""The arithmetic of IMU readings, of their derivatives and of links' loads, compiled; `imu_prediction`,
+`imu_jacobian` and `link_compliance` say what it computes.
 
 As in `regressor_kernel` the innermost loops run over the samples of a group, in lanes: compilers make vector
 instructions of loops over arrays whose rows are a constant distance apart.
@@ -60,8 +60,34 @@ class Path(NamedTuple):
     home: Array
 
 
+class Turns(NamedTuple):
+    """How links turn, k small turns of n links: the i-th link has those from first[i] to first[i + 1].
+
+    first: (n + 1,). hinge: (k, 3). theta: (k, 9, m) rotation vector, its first and its second derivative.
+    """
+
+    first: Index
+    hinge: Array
+    theta: Array
+
+
+class Carried(NamedTuple):
+    """What every one of n links carries, as masses at places of the root frame at q = 0.
+
+    own, link: (n,) [kg] of the module and of the link below it. at, middle: (n, 3) where these are.
+    hinge: (n, 3) about which the link turns. flipped: (n,) whether the module is mounted reversed.
+    """
+
+    own: Array
+    link: Array
+    at: Array
+    middle: Array
+    hinge: Array
+    flipped: NDArray[np.bool_]
+
+
 @compiled
-def fill_bodies(parent: Index, axis: Array, point: Array, joints: Array, bodies: Array) -> None:
+def fill_bodies(parent: Index, axis: Array, point: Array, joints: Array, turns: Turns, bodies: Array) -> None:
     """Write the motion of the bodies of n joints, m samples; that of the base, the last one, is given.
 
     At a point of the axis both bodies accelerate alike (Craig, Introduction to Robotics, eqs 6.45-6.48).
@@ -70,6 +96,7 @@ def fill_bodies(parent: Index, axis: Array, point: Array, joints: Array, bodies:
         parent: (n,) body below every joint, -1 for the base; before its children.
         axis, point: (n, 3) of the joints at q = 0.
         joints: (3, m, n) positions, velocities and accelerations.
+        turns: of the links below the joints.
         bodies: (n + 1, 9, m) angular rate, angular acceleration, acceleration against free fall.
     """
     count = len(parent)
@@ -80,10 +107,8 @@ def fill_bodies(parent: Index, axis: Array, point: Array, joints: Array, bodies:
         for s in range(joints.shape[1]):
             q, qd, qdd = joints[0, s, i], joints[1, s, i], joints[2, s, i]
             si, co = -sin(q), cos(q)
-            w = (bodies[below, 0, s], bodies[below, 1, s], bodies[below, 2, s])
-            dw = (bodies[below, 3, s], bodies[below, 4, s], bodies[below, 5, s])
-            a = (bodies[below, 6, s], bodies[below, 7, s], bodies[below, 8, s])
-            a = _plus(a, _plus(_cross(dw, p), _cross(w, _cross(w, p))))
+            w, dw, a = _beyond_link(bodies, below, turns, i, s)
+            a = _at(p, w, dw, a)
             w, dw, a = _turned(j, si, co, w), _turned(j, si, co, dw), _turned(j, si, co, a)
             spin = _times(j, qd)
             dw = _plus(dw, _plus(_cross(w, spin), _times(j, qdd)))
@@ -92,6 +117,87 @@ def fill_bodies(parent: Index, axis: Array, point: Array, joints: Array, bodies:
             bodies[i, 0, s], bodies[i, 1, s], bodies[i, 2, s] = w
             bodies[i, 3, s], bodies[i, 4, s], bodies[i, 5, s] = dw
             bodies[i, 6, s], bodies[i, 7, s], bodies[i, 8, s] = a
+
+
+@compiled
+def fill_readings(
+    carrier: Index, home: Array, turns: Turns, bodies: Array, gyro: Array, accel: Array
+) -> None:
+    """Write what ideal IMUs read, (m, n, 3) each.
+
+    Args:
+        carrier: (n,) body that every IMU is on, -1 for the base.
+        home: (n, 4, 4) of the IMUs.
+        turns: between that body and the IMU.
+        bodies: (n + 1, 9, m) of `fill_bodies`.
+    """
+    for k in range(len(carrier)):
+        body = carrier[k] if carrier[k] >= 0 else len(bodies) - 1
+        x = (home[k, 0, 3], home[k, 1, 3], home[k, 2, 3])
+        for s in range(gyro.shape[0]):
+            w, dw, a = _beyond_link(bodies, body, turns, k, s)
+            a = _at(x, w, dw, a)
+            for c in range(3):
+                gyro[s, k, c] = w[0] * home[k, 0, c] + w[1] * home[k, 1, c] + w[2] * home[k, 2, c]
+                accel[s, k, c] = a[0] * home[k, 0, c] + a[1] * home[k, 1, c] + a[2] * home[k, 2, c]
+
+
+@compiled
+def fill_loads(
+    parent: Index,
+    axis: Array,
+    point: Array,
+    q: Array,
+    carried: Carried,
+    turns: Turns,
+    bodies: Array,
+    loads: Array,
+) -> None:
+    """Write force and moment about its hinge, (n, 6, m), of all that hangs on the link below every joint.
+
+    Args:
+        parent, axis, point: of `fill_bodies`.
+        q: (m, n) positions.
+        carried: masses. Links on the base are no links, and have no load.
+        turns, bodies: as of `fill_bodies`.
+        loads: (n, 6, m) zeros; in the frame of the body that the link starts from.
+    """
+    count = len(parent)
+    beyond = np.zeros((count, 6, len(q)))  # force on every body, and its moment about the root's origin
+    for i in range(count - 1, -1, -1):
+        x, middle = carried.at[i], carried.middle[i]
+        at, mid = (x[0], x[1], x[2]), (middle[0], middle[1], middle[2])
+        j = (axis[i, 0], axis[i, 1], axis[i, 2])
+        p = (point[i, 0], point[i, 1], point[i, 2])
+        h = (carried.hinge[i, 0], carried.hinge[i, 1], carried.hinge[i, 2])
+        below = parent[i]
+        for s in range(len(q)):
+            f = (beyond[i, 0, s], beyond[i, 1, s], beyond[i, 2, s])
+            t = (beyond[i, 3, s], beyond[i, 4, s], beyond[i, 5, s])
+            if carried.flipped[i]:
+                w, dw, a = _motion(bodies, i, s)
+                one = _times(_at(at, w, dw, a), -carried.own[i])
+                f, t = _plus(f, one), _plus(t, _cross(at, one))
+            if below < 0:
+                continue
+            si, co = sin(q[s, i]), cos(q[s, i])
+            t = _turned(j, si, co, _minus(t, _cross(p, f)))
+            f = _turned(j, si, co, f)
+            t = _plus(t, _cross(p, f))
+            w, dw, a = _beyond_link(bodies, below, turns, i, s)
+            one = _times(_at(mid, w, dw, a), -carried.link[i])
+            f, t = _plus(f, one), _plus(t, _cross(mid, one))
+            if not carried.flipped[i]:
+                one = _times(_at(at, w, dw, a), -carried.own[i])
+                f, t = _plus(f, one), _plus(t, _cross(at, one))
+            loads[i, 0, s], loads[i, 1, s], loads[i, 2, s] = f
+            loads[i, 3, s], loads[i, 4, s], loads[i, 5, s] = _minus(t, _cross(h, f))
+            beyond[below, 0, s] += f[0]
+            beyond[below, 1, s] += f[1]
+            beyond[below, 2, s] += f[2]
+            beyond[below, 3, s] += t[0]
+            beyond[below, 4, s] += t[1]
+            beyond[below, 5, s] += t[2]
 
 
 @compiled
@@ -382,6 +488,37 @@ def _write_pose(group: _Group, i: int, last: int, c: int, shared: Array, start: 
         if i > 0:
             for k in range(LANES):
                 shared[below, a, start + k] = -group.block[a, k]
+
+
+@inlined
+def _motion(bodies: Array, body: int, s: int) -> tuple[Vector, Vector, Vector]:
+    """Return angular rate, angular acceleration and acceleration against free fall of a body at a sample."""
+    w = (bodies[body, 0, s], bodies[body, 1, s], bodies[body, 2, s])
+    dw = (bodies[body, 3, s], bodies[body, 4, s], bodies[body, 5, s])
+    return w, dw, (bodies[body, 6, s], bodies[body, 7, s], bodies[body, 8, s])
+
+
+@inlined
+def _beyond_link(bodies: Array, body: int, turns: Turns, i: int, s: int) -> tuple[Vector, Vector, Vector]:
+    """Return the motion beyond the i-th link, which starts from a body: `imu_prediction.given`."""
+    w, dw, a = _motion(bodies, body, s)
+    for k in range(turns.first[i], turns.first[i + 1]):
+        h, th = turns.hinge[k], turns.theta[k]
+        hinge = (h[0], h[1], h[2])
+        angle, rate = (th[0, s], th[1, s], th[2, s]), (th[3, s], th[4, s], th[5, s])
+        a = _at(hinge, w, dw, a)
+        a = _minus(a, _cross(angle, a))
+        gained = _plus((th[6, s], th[7, s], th[8, s]), _cross(w, rate))
+        dw = _plus(dw, _minus(gained, _cross(angle, dw)))
+        w = _plus(w, _minus(rate, _cross(angle, w)))
+        a = _at(_times(hinge, -1.0), w, dw, a)
+    return w, dw, a
+
+
+@inlined
+def _at(p: Vector, w: Vector, dw: Vector, a: Vector) -> Vector:
+    """Return the acceleration of a point that is fixed to a body."""
+    return _plus(a, _plus(_cross(dw, p), _cross(w, _cross(w, p))))
 
 
 @inlined

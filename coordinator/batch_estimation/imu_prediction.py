@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from coordinator.batch_estimation.imu_kernel import fill_bodies
+from coordinator.batch_estimation.imu_kernel import Turns, fill_bodies, fill_readings
 from coordinator.batch_estimation.sensor_data import BaseMotion
-from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import cross, skew
 
 
@@ -55,17 +55,27 @@ def imu_readings(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2
 
 def readings_on(chain: Chain, bodies: list[BodyMotion], turns: LinkTurns | None = None) -> ImuReadings:
     """Predict ideal IMUs from the motion of the bodies, as `body_motions` returns it for the same `turns`."""
-    joints = len(chain.serials)
-    samples = bodies[BASE].omega.shape[1]
-    gyro, accel = np.empty((samples, joints, 3)), np.empty((samples, joints, 3))
-    for k in range(joints):
-        motion = bodies[chain.carrier(k)]
-        if turns and not chain.reversed[k]:
-            motion = given(motion, turns.get(k, ()))
-        turn, place = chain.imu_home[k, :3, :3], chain.imu_home[k, :3, 3, None]
-        gyro[:, k] = motion.omega.T @ turn
-        accel[:, k] = acceleration_at(motion, place).T @ turn
+    joints, motion = len(chain.serials), stacked(bodies)
+    gyro, accel = (np.empty((motion.shape[2], joints, 3)) for _ in range(2))
+    carrier = np.array([chain.carrier(k) for k in range(joints)], dtype=np.int64)
+    between = {k: own for k, own in (turns or {}).items() if not chain.reversed[k]}
+    fill_readings(carrier, np.array(chain.imu_home), kernel_turns(between, motion), motion, gyro, accel)
     return ImuReadings(gyro, accel)
+
+
+def stacked(bodies: Sequence[BodyMotion]) -> Array:
+    """Return bodies, from `body_motions`, as kernels take them, (n + 1, 9, m)."""
+    return np.array([np.concatenate(body) for body in bodies])
+
+
+def kernel_turns(turns: LinkTurns | None, bodies: Array) -> Turns:
+    """Return the turns of links between bodies (n + 1, 9, m) as kernels take them."""
+    each = [(turns or {}).get(i, ()) for i in range(len(bodies) - 1)]
+    first = np.cumsum([0, *map(len, each)], dtype=np.int64)
+    hinge, theta = np.zeros((first[-1], 3)), np.zeros((first[-1], 9, bodies.shape[2]))
+    for k, turn in enumerate(turn for own in each for turn in own):
+        hinge[k], theta[k] = turn.hinge, turn.theta_rad.reshape(theta.shape[1:])
+    return Turns(first, hinge, theta)
 
 
 def body_motions(
@@ -81,25 +91,16 @@ def body_motions(
     Args as in `imu_readings`. `base_motion` is the base's motion measured by the first module's IMU; None
     means rest. `turns` are those of compliant links, by the module that each link carries.
     """
-    q, qd, qdd = (np.asarray(signal, dtype=float).T for signal in (q_rad, qd_rad_s, qdd_rad_s2))
-    base = _base(chain, q.shape[1], base_motion)
-    bodies: list[BodyMotion] = []
-    if turns is None:
-        motion = np.empty((len(chain.parent) + 1, 9, q.shape[1]))
-        motion[-1] = np.concatenate(base)
-        fill_bodies(
-            np.array(chain.parent, dtype=np.int64),
-            np.array(chain.axis),
-            np.array(chain.point),
-            np.stack([q.T, qd.T, qdd.T]),
-            motion,
-        )
-        return [BodyMotion(body[:3], body[3:6], body[6:]) for body in motion]
-    for i, parent in enumerate(chain.parent):
-        below = base if parent == BASE else bodies[parent]
-        below = given(below, turns.get(i, ()))
-        bodies.append(_carry(below, chain.axis[i], chain.point[i][:, None], q[i], qd[i], qdd[i]))
-    return [*bodies, base]
+    joints = np.array([q_rad, qd_rad_s, qdd_rad_s2], dtype=float)
+    motion = np.empty((len(chain.parent) + 1, 9, joints.shape[1]))
+    motion[-1] = np.concatenate(_base(chain, joints.shape[1], base_motion))
+    fill_bodies(*kernel_joints(chain), joints, kernel_turns(turns, motion), motion)
+    return [BodyMotion(body[:3], body[3:6], body[6:]) for body in motion]
+
+
+def kernel_joints(chain: Chain) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return parents (n,), axes and points (n, 3) of a chain's joints as kernels take them."""
+    return np.array(chain.parent, dtype=np.int64), np.array(chain.axis), np.array(chain.point)
 
 
 def given(body: BodyMotion, turns: Sequence[LinkTurn]) -> BodyMotion:
@@ -138,16 +139,3 @@ def turned(axis: Array, angle_rad: Array, vectors: Array) -> Array:
     across = (skew(axis) @ flat).reshape(vectors.shape)
     along = (np.outer(axis, axis) @ flat).reshape(vectors.shape)
     return np.asarray(along + np.cos(angle_rad) * (vectors - along) + np.sin(angle_rad) * across)
-
-
-def _carry(below: BodyMotion, axis: Array, point: Array, q: Array, qd: Array, qdd: Array) -> BodyMotion:
-    """Return the motion beyond a joint, in the frame that turns with it, from the motion below it.
-
-    At a point of the axis both bodies accelerate alike (Craig, Introduction to Robotics, eqs 6.45-6.48).
-    """
-    moved = np.stack([below.omega, below.alpha, acceleration_at(below, point)], axis=1)
-    turned_omega, turned_alpha, at_axis = np.swapaxes(turned(axis, -q, moved), 0, 1)
-    spin = axis[:, None] * qd
-    omega = turned_omega + spin
-    alpha = turned_alpha + cross(turned_omega, spin) + axis[:, None] * qdd
-    return BodyMotion(omega, alpha, acceleration_at(BodyMotion(omega, alpha, at_axis), -point))

@@ -14,18 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.batch_estimation.imu_jacobian import Displacements
+from coordinator.batch_estimation.imu_kernel import Carried, fill_loads
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
     LinkTurn,
     LinkTurns,
-    acceleration_at,
     body_motions,
-    given,
-    turned,
+    kernel_joints,
+    kernel_turns,
+    stacked,
 )
 from coordinator.batch_estimation.sensor_data import BaseMotion, SensorData
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import HINGE_SHARE, HINGE_SHARE_SIGMA
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate
@@ -92,27 +93,27 @@ def link_loads(
         turns: how the links turn, as far as it is known and contained in `bodies`: near a resonance the
             motion of compliant links is a load itself.
     """
-    samples = len(q_rad)
-    carried = [np.zeros((2, 3, samples)) for _ in chain.parent]  # force, and moment about the root's origin
-    loads: list[LinkLoad | None] = [None] * len(chain.parent)
-    for i in reversed(range(len(chain.parent))):
-        parent = chain.parent[i]
-        if chain.reversed[i]:
-            carried[i] += _weight(bodies[i], _place(chain, kinds, i, kinds[i].com_xyz), kinds[i].mass_kg)
-        if parent == BASE:
-            continue
-        below = _seen_from_below(chain, i, q_rad[:, i], carried[i])
+    count, motion = len(chain.parent), stacked(bodies)
+    starts, spans = np.zeros((count, 3)), np.zeros((count, 3))
+    for i in chain.linked:
         start, end = link_ends(chain, kinds, i)
-        length = float(np.linalg.norm(end - start))
-        beyond = given(bodies[parent], (turns or {}).get(i, ()))
-        below += _weight(beyond, 0.5 * (start + end), LINK_MASS_KG + LINK_MASS_KG_M * length)
-        if not chain.reversed[i]:
-            below += _weight(beyond, _place(chain, kinds, i, kinds[i].com_xyz), kinds[i].mass_kg)
-        hinge = start + HINGE_SHARE * (end - start)
-        along = (end - start) / max(length, 1e-9)
-        about = np.stack([below[0], below[1] - cross(hinge[:, None], below[0])])
-        loads[i] = LinkLoad(hinge, along, length, *about)
-        carried[parent] += below
+        starts[i], spans[i] = start, end - start
+    length = np.linalg.norm(spans, axis=1)
+    carried = Carried(
+        own=np.array([kind.mass_kg for kind in kinds]),
+        link=LINK_MASS_KG + LINK_MASS_KG_M * length,
+        at=np.array([_place(chain, kinds, i, kinds[i].com_xyz) for i in range(count)]),
+        middle=starts + 0.5 * spans,
+        hinge=starts + HINGE_SHARE * spans,
+        flipped=np.array(chain.reversed, dtype=bool),
+    )
+    signals = np.zeros((count, 6, len(q_rad)))
+    q = np.array(q_rad, dtype=float, order="C")
+    fill_loads(*kernel_joints(chain), q, carried, kernel_turns(turns, motion), motion, signals)
+    loads: list[LinkLoad | None] = [None] * count
+    for i in chain.linked:
+        along = spans[i] / max(length[i], 1e-9)
+        loads[i] = LinkLoad(carried.hinge[i], along, float(length[i]), signals[i, :3], signals[i, 3:])
     return _with_derivatives(loads, rate_hz)
 
 
@@ -157,20 +158,6 @@ def _place(chain: Chain, kinds: Sequence[ModuleType], module: int, xyz: ArrayLik
     """Return where a point of a module's housing is at q = 0."""
     home = chain.imu_home[module]
     return np.asarray(home[:3, :3] @ (np.array(xyz) - np.array(kinds[module].imu_xyz)) + home[:3, 3])
-
-
-def _weight(body: BodyMotion, place: Array, mass_kg: float) -> Array:
-    """Return the force (3, m) of a mass at a place (3,) of a body on it, and its moment about the origin."""
-    force = -mass_kg * acceleration_at(body, place[:, None])
-    return np.stack([force, cross(np.broadcast_to(place[:, None], force.shape), force)])
-
-
-def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
-    """Return force and moment (2, 3, m) beyond a joint in the frame of the body below it."""
-    axis, point = chain.axis[joint], np.broadcast_to(chain.point[joint][:, None], load[0].shape)
-    about_point = np.stack([load[0], load[1] - cross(point, load[0])], axis=1)
-    force, moment = np.swapaxes(turned(axis, q, about_point), 0, 1)
-    return np.stack([force, moment + cross(point, force)])
 
 
 class ComplianceJacobian(NamedTuple):

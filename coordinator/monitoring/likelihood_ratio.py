@@ -24,11 +24,12 @@ With h = B^T b + L^T l the change of one hypothesis has, theta eliminated (Schur
 """
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.special import chdtri
 
 from module_agent.model.chain import Array
@@ -101,7 +102,8 @@ def without_own(evidence: Evidence, own_sigma: ArrayLike) -> Evidence:
     own, rest = slice(0, sigma.size), slice(sigma.size, None)
     across = sigma[:, None] * evidence.matrix[own, rest]
     columns = np.column_stack([across, sigma * evidence.vector[own]])
-    solved = _with_prior(sigma[:, None] * evidence.matrix[own, own] * sigma, columns)
+    matrix = np.eye(sigma.size) + sigma[:, None] * evidence.matrix[own, own] * sigma
+    solved = cho_solve(cho_factor(matrix, check_finite=False), columns, check_finite=False)
     return _read_only(
         evidence.matrix[rest, rest] - across.T @ solved[:, :-1],
         evidence.vector[rest] - across.T @ solved[:, -1],
@@ -118,63 +120,92 @@ def tempered(evidence: Evidence, inflation: float) -> Evidence:
     return _read_only(evidence.matrix / inflation, evidence.vector / inflation)
 
 
-def find_changes(
-    before: Evidence,
-    later: Evidence,
-    prior_sigma: ArrayLike,
-    changes: Sequence[Array],
-    likely: Sequence[float] | None = None,
-) -> tuple[Change, ...]:
-    """Return the best change of every hypothesis about what changed between two stretches of time.
+class ChangeTest:
+    """Tests later stretches of time against one that is known; what all of these tests share is made once."""
 
-    Args:
-        before, later: about the same p parameters, as deviations from where a first model has them.
-        prior_sigma: (p,) how far a parameter may be from there, before anything was measured.
-        changes: per hypothesis the matrix (p, d) from its own parameters to the change of theta, in units in
-            which a change of 1 is large: there is a prior of that size on them.
-        likely: per hypothesis how large changes are by which it is judged: its gain is that under a prior of
-            this size, its size and covariance are those under a prior of 1; None for 1 of all.
+    def __init__(
+        self,
+        before: Evidence,
+        prior_sigma: ArrayLike,
+        changes: Sequence[Array],
+        likely: Sequence[float] | None = None,
+        inflation: float = 1.0,
+    ):
+        """Take what is known before.
 
-    Raises:
-        ValueError: evidence about different parameters.
-    """
-    former, latter, sigma = _scaled(before, later, prior_sigma)
-    # A robot without links has no link that could have changed.
-    if not changes:
-        return ()
-    wide = np.column_stack(changes) / sigma[:, None]
-    seen = latter.matrix @ wide
-    columns = np.column_stack([seen, former.vector + latter.vector])
-    solved = _with_prior(former.matrix + latter.matrix, columns)
-    vector = wide.T @ latter.vector - seen.T @ solved[:, -1]
-    found, first = [], 0
-    for change, usual in zip(changes, likely or [1.0] * len(changes), strict=True):
-        own = slice(first, first + change.shape[1])
-        matrix = wide[:, own].T @ seen[:, own] - seen[:, own].T @ solved[:, own]
-        found.append(_best_change(matrix, vector[own], usual))
-        first = own.stop
-    return tuple(found)
+        Args:
+            before: about p parameters, as deviations from where a first model has them.
+            prior_sigma: (p,) how far a parameter may be from there, before anything was measured.
+            changes: per hypothesis about what changed the matrix (p, d) from its own parameters to the change
+                of theta, in units in which a change of 1 is large: there is a prior of that size on them.
+            likely: per hypothesis how large changes are by which it is judged: its gain is that under a prior
+                of this size, its size and covariance are those under a prior of 1; None for 1 of all.
+            inflation: later evidence is tempered by that.
+
+        Raises:
+            ValueError: evidence about other parameters.
+        """
+        self._sigma = np.asarray(prior_sigma, dtype=float)
+        self._before = self._scaled(before)
+        self._known = self._before.matrix + np.eye(len(self._sigma))
+        self._inflation = inflation
+        self._widths = [change.shape[1] for change in changes]
+        # A robot without links has no link that could have changed.
+        self._wide = np.column_stack([*changes, np.zeros((len(self._sigma), 0))]) / self._sigma[:, None]
+        self._likely = np.asarray(likely or np.ones(len(changes)), dtype=float)
+
+    def find(self, later: Evidence) -> tuple[Change, ...]:
+        """Return the best change of every hypothesis about what changed since.
+
+        Raises:
+            ValueError: evidence about other parameters.
+        """
+        latter = self._scaled(later, self._inflation)
+        columns = np.empty((len(self._sigma), sum(self._widths) + 1), order="F")
+        columns[:, :-1] = latter.matrix @ self._wide
+        columns[:, -1] = self._before.vector + latter.vector
+        matrix, vector = self._wide.T @ columns[:, :-1], self._wide.T @ latter.vector
+        # Of M^-1 only products with it from both sides are wanted: one half of its factors is enough.
+        half = _half_solved(self._known + latter.matrix, columns)
+        matrix -= half[:, :-1].T @ half[:, :-1]
+        vector -= half[:, :-1].T @ half[:, -1]
+        found: list[Change] = []
+        first = 0
+        for width, group in groupby(self._widths):
+            count = len(list(group))
+            own = (first + np.arange(width * count)).reshape(count, width)
+            likely = self._likely[len(found) : len(found) + count]
+            found += _best_changes(matrix[own[:, :, None], own[:, None]], vector[own], likely)
+            first += width * count
+        return tuple(found)
+
+    def misfit(self, later: Evidence) -> float:
+        """Return what there is to explain: by how much [variances] two robots fit better than one, each with
+        the prior.
+
+        Raises:
+            ValueError: evidence about other parameters.
+        """
+        unit, latter = np.eye(len(self._sigma)), self._scaled(later, self._inflation)
+        robots = [
+            (self._known, self._before.vector),
+            (latter.matrix + unit, latter.vector),
+            (self._known + latter.matrix, self._before.vector + latter.vector),
+        ]
+        first, second, both = (float(np.sum(_half_solved(m, v[:, None]) ** 2)) for m, v in robots)
+        return first + second - both
+
+    def _scaled(self, one: Evidence, inflation: float = 1.0) -> Evidence:
+        """Return tempered evidence about parameters in standard deviations of their prior."""
+        if one.parameters != self._sigma.size:
+            raise ValueError(f"evidence about {one.parameters} parameters, prior of {self._sigma.size}")
+        less = self._sigma / inflation
+        return Evidence(less[:, None] * one.matrix * self._sigma, less * one.vector)
 
 
 def most_of(changes: Sequence[Change]) -> int:
     """Return which hypothesis explains most."""
     return int(np.argmax([change.gain for change in changes]))
-
-
-def misfit_of(before: Evidence, later: Evidence, prior_sigma: ArrayLike) -> float:
-    """Return what there is to explain: by how much [variances] two robots fit better than one, each with the
-    prior.
-
-    Raises:
-        ValueError: evidence about different parameters.
-    """
-    former, latter, _ = _scaled(before, later, prior_sigma)
-    both = Evidence(former.matrix + latter.matrix, former.vector + latter.vector)
-    apart, together = [
-        sum(float(one.vector @ _with_prior(one.matrix, one.vector)) for one in robots)
-        for robots in ((former, latter), (both,))
-    ]
-    return apart - together
 
 
 def gain_above(freedom: int, tests_per_hour: float, alarms_per_hour: float) -> float:
@@ -190,31 +221,19 @@ def _read_only(matrix: Array, vector: Array) -> Evidence:
     return Evidence(matrix, vector)
 
 
-def _scaled(before: Evidence, later: Evidence, prior_sigma: ArrayLike) -> tuple[Evidence, Evidence, Array]:
-    """Return both about parameters in standard deviations of their prior, and these."""
-    sigma = np.asarray(prior_sigma, dtype=float)
-    if before.parameters != sigma.size or later.parameters != sigma.size:
-        raise ValueError(
-            f"evidence about {before.parameters} and {later.parameters} parameters, prior of {sigma.size}"
-        )
-    former, latter = (
-        Evidence(sigma[:, None] * one.matrix * sigma, sigma * one.vector) for one in (before, later)
-    )
-    return former, latter, sigma
+def _half_solved(matrix: Array, columns: Array) -> Array:
+    """Return L^-1 columns of a matrix L L^T."""
+    # It is symmetric; transposed it is laid out as LAPACK has its matrices, and is not copied.
+    factor = cholesky(matrix.T, lower=True, check_finite=False)
+    return np.asarray(solve_triangular(factor, columns, lower=True, check_finite=False))
 
 
-def _with_prior(matrix: Array, columns: Array) -> Array:
-    """Return (1 + matrix)^-1 columns."""
-    factor = cho_factor(matrix + np.eye(len(matrix)), overwrite_a=True, check_finite=False)
-    return np.asarray(cho_solve(factor, columns, check_finite=False))
-
-
-def _best_change(matrix: Array, vector: Array, likely: float) -> Change:
-    unit = np.eye(vector.size)
-    covariance = np.asarray(np.linalg.inv(matrix + unit), dtype=np.float64)
-    best: Array = covariance @ vector
-    gain = float(vector @ best)
-    if likely != 1.0:
-        gain = float(vector @ np.linalg.solve(matrix + unit / likely**2, vector))
-    make_read_only((best, covariance))
-    return Change(gain, best, covariance)
+def _best_changes(matrices: Array, vectors: Array, likely: Array) -> list[Change]:
+    """Return the best changes of k hypotheses by their S - 1 (k, d, d) and r (k, d)."""
+    unit = np.eye(vectors.shape[1])
+    covariances = np.linalg.inv(matrices + unit)
+    best = np.matvec(covariances, vectors)
+    judged = np.linalg.solve(matrices + unit / likely[:, None, None] ** 2, vectors[..., None])[..., 0]
+    gains = np.vecdot(vectors, judged)
+    make_read_only((best, covariances))
+    return [Change(float(gain), *one) for gain, *one in zip(gains, best, covariances, strict=True)]

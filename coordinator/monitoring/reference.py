@@ -6,6 +6,8 @@ the rest is what they find in a robot that has not changed; by that their noise 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -21,11 +23,10 @@ from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_trans
 from coordinator.monitoring.contact import ContactModel, FastPart, contact_model
 from coordinator.monitoring.likelihood_ratio import (
     Change,
+    ChangeTest,
     Evidence,
-    find_changes,
     gain_above,
     joined,
-    misfit_of,
     tempered,
     without_own,
 )
@@ -108,11 +109,12 @@ class UnsuitableBaseline(UsageError):
     """The run does not hold what the watch needs; the message says what is missing."""
 
 
-class BaselineTest(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class BaselineTest:
     """Evidence of the known run about one thing, and what may have changed later.
 
     evidence: about p parameters that stay. own_sigma, prior_sigma: (o,) and (p,) how far those that are each
-    window's own, and those that stay, may be from the model. changes: of all (o + p), see `find_changes`.
+    window's own, and those that stay, may be from the model. changes: of all (o + p), see `ChangeTest`.
     likely: see there. inflation: by how much the variance of noise is larger than it was taken to be, as the
     model is not exact: all evidence is tempered by it, `evidence` is already, and priors are not.
     """
@@ -126,26 +128,19 @@ class BaselineTest(NamedTuple):
 
     def find(self, later: Evidence) -> tuple[Change, ...]:
         """Test the evidence of a later window, about all parameters."""
-        return find_changes(
-            self.before, tempered(later, self.inflation), self.sigma, self.changes, self.likely
-        )
+        return self._test.find(later)
 
     def misfit(self, later: Evidence) -> float:
         """Return what there is to explain of a later window, as gains are."""
-        return misfit_of(self.before, tempered(later, self.inflation), self.sigma)
+        return self._test.misfit(later)
 
-    @property
-    def before(self) -> Evidence:
-        """What the run says of all parameters: nothing of those that are a later window's own."""
-        own, size = self.own_sigma.size, self.own_sigma.size + self.prior_sigma.size
-        matrix, vector = np.zeros((size, size)), np.zeros(size)
-        matrix[own:, own:], vector[own:] = self.evidence.matrix, self.evidence.vector
-        return Evidence(matrix, vector)
-
-    @property
-    def sigma(self) -> Array:
-        """How far all parameters may be from the model, (o + p,)."""
-        return np.concatenate([self.own_sigma, self.prior_sigma])
+    @cached_property
+    def _test(self) -> ChangeTest:
+        # The run says nothing of parameters that are a later window's own.
+        own, sigma = self.own_sigma.size, np.concatenate([self.own_sigma, self.prior_sigma])
+        before = Evidence(np.zeros((sigma.size, sigma.size)), np.zeros(sigma.size))
+        before.matrix[own:, own:], before.vector[own:] = self.evidence.matrix, self.evidence.vector
+        return ChangeTest(before, sigma, self.changes, self.likely, self.inflation)
 
 
 class Reference(NamedTuple):

@@ -128,14 +128,19 @@ def _call_regressor() -> None:
 
 def _call_estimator() -> None:
     from coordinator.batch_estimation.estimator import refine_chain
-    from coordinator.batch_estimation.imu_prediction import imu_readings
+    from coordinator.batch_estimation.imu_prediction import body_motions, imu_readings
+    from coordinator.batch_estimation.link_compliance import link_loads
     from coordinator.batch_estimation.sensor_data import SensorData
+    from coordinator.synchronisation.motion_windows import RATE_HZ
+    from module_agent.model.catalogue import module_type
     from sim.robot.robot_file import load_robot
     from sim.robot.robot_tree import true_chain
 
     robot = load_robot(ROBOT)
+    types = [module_type(one.type) for one in robot.modules]
     chain, at_rest = true_chain(robot), np.zeros((REST, len(robot.modules)))
     refine_chain(chain, SensorData(*(at_rest,) * 3, *imu_readings(chain, *(at_rest,) * 3)))
+    link_loads(chain, types, body_motions(chain, *(at_rest,) * 3), at_rest, RATE_HZ)
 
 
 if __name__ == "__main__":

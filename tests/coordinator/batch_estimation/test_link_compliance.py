@@ -10,6 +10,7 @@ from coordinator.batch_estimation.imu_prediction import (
     LinkTurn,
     acceleration_at,
     body_motions,
+    given,
     imu_readings,
     readings_on,
 )
@@ -75,10 +76,30 @@ def test_a_turn_of_a_link_is_that_of_a_joint_in_it(robots: Any) -> None:
     turns = {2: [LinkTurn(place, np.stack([np.outer(axis, s) for s in (angle, rate, acceleration)]))]}
     found = readings_on(chain, body_motions(chain, q, qd, qdd, turns=turns), turns)
     rigid = imu_readings(chain, q, qd, qdd)
-    for given, right, stiff in zip(found, exact, rigid, strict=True):
+    for mine, right, stiff in zip(found, exact, rigid, strict=True):
         # The turn changes the readings, as predicted but for terms with its square.
         assert np.abs(right[:, 3] - stiff[:, 2]).max() > size
-        np.testing.assert_allclose(given[:, 2], right[:, 3], atol=100 * size**2)
+        np.testing.assert_allclose(mine[:, 2], right[:, 3], atol=100 * size**2)
+
+
+def test_compiled_turns_are_those_of_the_formula_one_after_the_other(robots: Any) -> None:
+    """Beyond a joint that stands at zero the body moves as the end of the link below it does."""
+    chain, _ = robots.random(11, 5, serial=False)
+    rng = np.random.default_rng(2)
+    q, qd, qdd = (rng.normal(size=(40, 5)) for _ in range(3))
+    turns = {k: [LinkTurn(*_turn(rng)), LinkTurn(*_turn(rng))] for k in chain.linked[1:]}
+    for k in chain.linked:
+        for signal in (q, qd, qdd):
+            signal[:, k] = 0.0
+    bodies = body_motions(chain, q, qd, qdd, turns=turns)
+    for k in chain.linked:
+        beyond = given(bodies[chain.parent[k]], turns.get(k, ()))
+        for compiled, formula in zip(bodies[k], beyond, strict=True):
+            np.testing.assert_allclose(compiled, formula, atol=1e-12)
+
+
+def _turn(rng: np.random.Generator) -> tuple[Array, Array]:
+    return 0.3 * rng.normal(size=3), 0.1 * rng.normal(size=(3, 3, 40))
 
 
 def test_the_moment_about_a_joint_is_that_of_newton_and_euler(robots: Any) -> None:
@@ -103,6 +124,29 @@ def test_the_moment_about_a_joint_is_that_of_newton_and_euler(robots: Any) -> No
     np.testing.assert_allclose(load.force[0], force, atol=1e-12)
     about_joint = load.moved(chain.point[1] - load.hinge).moment[0]
     np.testing.assert_allclose(-chain.axis[1] @ about_joint, torque[:, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_at_rest_a_link_carries_the_weight_of_all_modules_and_links_beyond(robots: Any, seed: int) -> None:
+    """Trees with modules that are mounted reversed: masses at their places, at zero."""
+    chain, types = robots.random(seed, 6, serial=False)
+    still = np.zeros((20, 6))
+    loads = link_loads(chain, types, body_motions(chain, still, still, still), still, RATE_HZ)
+    for link in chain.linked:
+        load = loads[link]
+        assert load is not None
+        force, moment = np.zeros(3), np.zeros(3)
+        for k in chain.descendants(link):
+            begin, end = link_ends(chain, types, k)
+            own = np.array(types[k].com_xyz) - np.array(types[k].imu_xyz)
+            place = chain.imu_home[k, :3, :3] @ own + chain.imu_home[k, :3, 3]
+            link_kg = LINK_MASS_KG + LINK_MASS_KG_M * float(np.linalg.norm(end - begin))
+            for mass_kg, at in ((types[k].mass_kg, place), (link_kg, 0.5 * (begin + end))):
+                force -= mass_kg * chain.gravity
+                moment -= mass_kg * np.cross(at - load.hinge, chain.gravity)
+        np.testing.assert_allclose(load.force[0], np.tile(force, (20, 1)).T, atol=1e-9)
+        np.testing.assert_allclose(load.moment[0], np.tile(moment, (20, 1)).T, atol=1e-9)
+        assert np.abs(load.moment[1:]).max() < 1e-9
 
 
 def test_loads_change_as_their_derivatives_say(robots: Any) -> None:

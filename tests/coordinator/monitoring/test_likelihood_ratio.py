@@ -6,12 +6,11 @@ from numpy.random import Generator
 from scipy.stats import chi2
 
 from coordinator.monitoring.likelihood_ratio import (
+    ChangeTest,
     Evidence,
     evidence_of,
-    find_changes,
     gain_above,
     joined,
-    misfit_of,
     tempered,
     without_own,
 )
@@ -34,7 +33,7 @@ def test_gain_and_size_are_those_of_least_squares_over_all_samples_at_once(rng: 
     theta = rng.normal(size=PARAMETERS)
     changed = theta + CHANGE @ [0.004, -0.002]
     (b, y), (later, z) = measured(rng, theta), measured(rng, changed)
-    found = find_changes(evidence_of(b, y), evidence_of(later, z), WIDE, (CHANGE,))[0]
+    found = ChangeTest(evidence_of(b, y), WIDE, (CHANGE,)).find(evidence_of(later, z))[0]
     # All samples, the prior of theta and that of the change as rows of their own.
     none = np.zeros((len(b), 2))
     rows = np.vstack(
@@ -57,13 +56,8 @@ def test_gain_and_size_are_those_of_least_squares_over_all_samples_at_once(rng: 
 
 def test_chance_exceeds_a_level_as_seldom_as_was_asked_for(rng: Generator) -> None:
     theta = rng.normal(size=PARAMETERS)
-    before = evidence_of(*measured(rng, theta, 2000))
-    gains = np.array(
-        [
-            find_changes(before, evidence_of(*measured(rng, theta, 50)), WIDE, (CHANGE,))[0].gain
-            for _ in range(1500)
-        ]
-    )
+    test = ChangeTest(evidence_of(*measured(rng, theta, 2000)), WIDE, (CHANGE,))
+    gains = np.array([test.find(evidence_of(*measured(rng, theta, 50)))[0].gain for _ in range(1500)])
     # Of 1500 draws 150 exceed what one in ten does, give or take 3.5 binomial sigmas of 12.
     level = gain_above(2, 10.0, 1.0)
     assert level == pytest.approx(chi2.isf(0.1, 2))
@@ -74,7 +68,7 @@ def test_what_neither_stretch_tells_makes_no_gain(rng: Generator) -> None:
     rows = rng.normal(size=(100, PARAMETERS))
     rows[:, :2] = 0.0
     quiet = evidence_of(rows, rng.normal(size=100))
-    assert find_changes(quiet, quiet, WIDE, (CHANGE,))[0].gain == pytest.approx(0.0, abs=1e-9)
+    assert ChangeTest(quiet, WIDE, (CHANGE,)).find(quiet)[0].gain == pytest.approx(0.0, abs=1e-9)
 
 
 def test_joined_evidence_is_that_of_all_samples_in_any_order(rng: Generator) -> None:
@@ -107,7 +101,7 @@ def test_evidence_about_other_parameters_is_refused() -> None:
     with pytest.raises(ValueError, match="cannot be joined"):
         joined([one, other])
     with pytest.raises(ValueError, match="prior of 3"):
-        find_changes(one, other, np.ones(3), (np.eye(3),))
+        ChangeTest(one, np.ones(3), (np.eye(3),)).find(other)
     with pytest.raises(ValueError, match="not finite"):
         evidence_of([[np.nan]], [0.0])
 
@@ -115,19 +109,19 @@ def test_evidence_about_other_parameters_is_refused() -> None:
 def test_where_nothing_could_have_changed_there_is_no_change(rng: Generator) -> None:
     """A robot of one module has no link."""
     evidence = evidence_of(*measured(rng, rng.normal(size=PARAMETERS)))
-    assert find_changes(evidence, evidence, WIDE, ()) == ()
+    assert ChangeTest(evidence, WIDE, ()).find(evidence) == ()
 
 
 def test_the_misfit_of_one_robot_is_chance_and_of_two_what_sets_them_apart(rng: Generator) -> None:
     theta = rng.normal(size=PARAMETERS)
-    before = evidence_of(*measured(rng, theta, 2000))
-    same = [misfit_of(before, evidence_of(*measured(rng, theta, 50)), WIDE) for _ in range(300)]
+    test = ChangeTest(evidence_of(*measured(rng, theta, 2000)), WIDE, ())
+    same = [test.misfit(evidence_of(*measured(rng, theta, 50))) for _ in range(300)]
     # The mean of 300 chi-square draws of 6 degrees of freedom: within 3.5 sigmas of 0.2.
     assert np.mean(same) == pytest.approx(PARAMETERS, abs=0.7)
     rows, target = measured(rng, theta + 1.0, 50)
     apart = evidence_of(rows, target)
     # Two robots leave the noise, one leaves besides it what their difference makes of the later rows.
-    assert misfit_of(before, apart, WIDE) == pytest.approx(np.sum((rows @ np.ones(PARAMETERS)) ** 2), rel=0.3)
+    assert test.misfit(apart) == pytest.approx(np.sum((rows @ np.ones(PARAMETERS)) ** 2), rel=0.3)
 
 
 def test_rows_that_hardly_tell_a_parameter_keep_the_gain_of_a_qr(rng: Generator) -> None:
@@ -140,7 +134,7 @@ def test_rows_that_hardly_tell_a_parameter_keep_the_gain_of_a_qr(rng: Generator)
         later @ (theta + 3.0 * np.eye(PARAMETERS)[3]) + rng.normal(size=400),
     )
     change = np.eye(PARAMETERS)[:, 2:4]
-    found = find_changes(evidence_of(b, y), evidence_of(later, z), np.ones(PARAMETERS), (change,))[0]
+    found = ChangeTest(evidence_of(b, y), np.ones(PARAMETERS), (change,)).find(evidence_of(later, z))[0]
     rows = np.vstack(
         [
             np.column_stack([b, np.zeros((400, 2))]),
