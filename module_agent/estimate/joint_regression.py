@@ -133,6 +133,9 @@ class _Equations(NamedTuple):
     noise: Array
 
 
+_DIVERGES = "the fit diverges: no motion of the joint explains what the IMU read, is it sick?"
+
+
 def regress_joint(
     motions: Sequence[ObservedMotion],
     rest: RestReading | None,
@@ -152,12 +155,17 @@ def regress_joint(
             readings no motion of the joint explains.
     """
     problem, guess = _problem(motions, rest, knowledge)
-    # A sensor at the end of its range can take the fit anywhere.
-    with np.errstate(over="ignore", invalid="ignore"):
-        state, covariance = _minimise(problem, guess)
-    if not np.isfinite(covariance).all():
-        raise DataError("the fit diverges: no motion of the joint explains what the IMU read, is it sick?")
-    return _result(state, covariance, problem, _systematic(state, covariance, problem, symmetric_load))
+    # A sensor at the end of its range can take the fit anywhere, also to where variances are negative.
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            state, covariance = _minimise(problem, guess)
+            systematic = _systematic(state, covariance, problem, symmetric_load)
+            found = _result(state, covariance, problem, systematic)
+    except np.linalg.LinAlgError as error:
+        raise DataError(_DIVERGES) from error
+    if not np.isfinite([*found.covariance.flat, found.sigma_axis_rad, found.sigma_distance_m]).all():
+        raise DataError(_DIVERGES)
+    return found
 
 
 def distance_bound_m(

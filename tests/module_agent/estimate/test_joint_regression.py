@@ -1,5 +1,6 @@
 """The joint regression on a drawn hinge whose truth is known, and on the simulated arm in its own tests."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -180,3 +181,37 @@ def test_smoothing_passes_polynomials_and_takes_their_derivatives() -> None:
     np.testing.assert_allclose(values[:, 3], 0.0, atol=1e-2)
     spline = CubicSpline(t_s, q)
     np.testing.assert_allclose(values[:, 8], spline(at, 1) ** 2, atol=1e-3)
+
+
+def test_of_readings_that_no_motion_explains_nothing_is_claimed(link: Any) -> None:
+    """Samples damaged at any size: a finite estimate, or a sentence; no warning of the arithmetic."""
+    rest = rest_reading(link.rest(np.random.default_rng(5)))
+    motions = link.constant(1.0, 1), link.sine(0.1, 1)
+    refused = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        size = 10.0 ** rng.uniform(0.0, 14.0)
+        damaged = [seen((_damaged(imu, seed, size, rng), joint)) for imu, joint in motions]
+        try:
+            with warnings.catch_warnings(action="error"):
+                found = regress_joint(damaged, rest, CALIBRATED)
+        except DataError as error:
+            refused.append(str(error))
+            continue
+        assert np.isfinite([found.sigma_distance_m, found.sigma_axis_rad, *found.covariance.flat]).all()
+    assert any("the fit diverges" in one for one in refused)
+    assert len(refused) < 60
+
+
+def _damaged(imu: ImuWindow, kind: int, size: float, rng: np.random.Generator) -> ImuWindow:
+    gyro, accel = imu.gyro_rad_s.copy(), imu.accel_m_s2.copy()
+    match kind % 4:
+        case 0:
+            accel[rng.integers(len(accel))] *= size
+        case 1:
+            gyro[rng.integers(len(gyro))] *= size
+        case 2:
+            accel[:] = size * rng.normal(size=accel.shape)
+        case _:
+            gyro[:, rng.integers(3)] = accel[:, rng.integers(3)] = size
+    return imu._replace(gyro_rad_s=gyro, accel_m_s2=accel)
