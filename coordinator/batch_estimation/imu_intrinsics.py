@@ -106,11 +106,11 @@ def mixing(intrinsics: ImuIntrinsics, module: int) -> Array:
 
 
 def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool_]) -> Array:
-    """Return the derivatives of one IMU's readings by those of its errors that are free, (k, 6, m).
+    """Return the derivatives of IMUs' readings by those of their own errors that are free, (k, 6, ..., m).
 
-    gyro, accel: (m, 3) true values. rates: (m, 6) or None. free: (34,).
+    gyro, accel: (m, ..., 3) true values. rates: (m, ..., 6) or None. free: (34,).
     """
-    derivatives = np.zeros((SIZE, 6, len(gyro)))
+    derivatives = np.zeros((SIZE, 6, *gyro.T.shape[1:]))
     for axis in range(6):
         errors, by_error = axis_slopes(gyro, accel, rates, axis)
         derivatives[errors, axis] = by_error
@@ -118,15 +118,15 @@ def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool
 
 
 def axis_slopes(gyro: Array, accel: Array, rates: Array | None, axis: int) -> tuple[Index, Array]:
-    """Return on which errors one axis of an IMU depends, and the derivatives of its readings by them (k, m).
+    """Return on which errors an axis of IMUs depends, and its readings' derivatives by them (k, ..., m).
 
-    gyro, accel: (m, 3) true values. rates: (m, 6) of the readings, or None without delays. axis: 0 to 2 of
-    the gyro, 3 to 5 of the accelerometer.
+    gyro, accel: (m, ..., 3) true values. rates: (m, ..., 6) of the readings, or None without delays. axis: 0
+    to 2 of the gyro, 3 to 5 of the accelerometer.
     """
     matrix, bias, by_axis = 3 * axis + np.arange(3), GYRO_BIAS.start + axis, (gyro if axis < 3 else accel).T
-    parts = [(matrix, by_axis), ([bias], np.ones((1, len(gyro))))]
+    parts = [(matrix, by_axis), ([bias], np.ones((1, *by_axis.shape[1:])))]
     if rates is not None:
-        parts.append(([DELAY], -rates[:, axis][None]))
+        parts.append(([DELAY], -rates[..., axis].T[None]))
     if axis < 3:
         parts.append((FORCE.start + matrix, accel.T))
     errors, derivatives = zip(*parts, strict=True)

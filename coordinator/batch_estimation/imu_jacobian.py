@@ -142,21 +142,23 @@ def weighted_slopes(
 
 
 def imu_jacobian(
-    chain: Chain, bodies: Sequence[BodyMotion], q_rad: Array, qd_rad_s: Array, module: int
+    chain: Chain, motion: Motion, samples: int, module: int, mixing: Array | None = None
 ) -> ImuJacobian:
     """Differentiate the readings of one module's IMU.
 
     Args:
         chain: n joints.
-        bodies: their motion, from `body_motions`.
-        q_rad, qd_rad_s: (m, n) joint positions and velocities.
+        motion: of the chain, in m' places.
+        samples: m of these.
         module: the module that the IMU belongs to.
+        mixing: (6, 6) from true rates and forces to readings; None of a perfect IMU.
     """
-    path, motion = imu_path(chain, module), kernel_motion(bodies, q_rad, qd_rad_s)
-    samples, size = len(q_rad), 6 * len(path.modules)
+    path = imu_path(chain, module)
+    size = 6 * len(path.modules)
     none = Displacements((), (), np.empty((0, 18, motion.bodies.shape[2])))
     ones, zeros = np.ones((2, samples)), np.zeros((6, samples))
-    shared, placed = weighted_slopes(path, motion, none.twists, seen_by(path, none), np.eye(6), ones, zeros)
+    mixed = np.eye(6) if mixing is None else mixing
+    shared, placed = weighted_slopes(path, motion, none.twists, seen_by(path, none), mixed, ones, zeros)
     shared, placed = shared[..., :samples], placed[..., :samples]
     return ImuJacobian(tuple(path.modules.tolist()), shared[:size], shared[size:-1], placed)
 

@@ -8,6 +8,7 @@ one for twisting to be estimated. Without it a link that gives by 1 % is estimat
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import HINGE_SHARE, HINGE_SHARE_SIGMA
 from module_agent.model.perturbation import cross
+from module_agent.model.read_only import read_only
 from module_agent.signals.filtering import differentiate
 
 # Sigma of the hinge's distance from the line between the faces: tubes are centimetres off the modules' axes.
@@ -70,8 +72,13 @@ class LinkLoad(NamedTuple):
     @property
     def shifts(self) -> Array:
         """Unit shifts (3, 3) of the hinge: by the link's length along it, and by a metre to either side."""
-        aside = np.linalg.svd(self.along[None])[2][1:]
-        return np.vstack([self.length_m * self.along, aside])
+        return np.vstack([self.length_m * self.along, _aside(tuple(self.along.tolist()))])
+
+
+@lru_cache(maxsize=1024)
+def _aside(along: tuple[float, ...]) -> Array:
+    """Return two unit directions across one, (2, 3): the same ones each time, as estimates are about them."""
+    return read_only(np.linalg.svd(np.array(along)[None])[2][1:])
 
 
 def link_loads(

@@ -29,7 +29,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.sparse import csr_array
 from scipy.special import chdtri
 
 from module_agent.model.chain import Array
@@ -151,7 +153,9 @@ class ChangeTest:
         self._inflation = inflation
         self._widths = [change.shape[1] for change in changes]
         # A robot without links has no link that could have changed.
-        self._wide = np.column_stack([*changes, np.zeros((len(self._sigma), 0))]) / self._sigma[:, None]
+        wide = np.column_stack([*changes, np.zeros((len(self._sigma), 0))]) / self._sigma[:, None]
+        # Sparse: of all parameters each change touches a few.
+        self._wide = csr_array(wide.T)
         self._likely = np.asarray(likely or np.ones(len(changes)), dtype=float)
 
     def find(self, later: Evidence) -> tuple[Change, ...]:
@@ -162,9 +166,9 @@ class ChangeTest:
         """
         latter = self._scaled(later, self._inflation)
         columns = np.empty((len(self._sigma), sum(self._widths) + 1), order="F")
-        columns[:, :-1] = latter.matrix @ self._wide
+        columns[:, :-1] = (self._wide @ latter.matrix).T
         columns[:, -1] = self._before.vector + latter.vector
-        matrix, vector = self._wide.T @ columns[:, :-1], self._wide.T @ latter.vector
+        matrix, vector = self._wide @ columns[:, :-1], self._wide @ latter.vector
         # Of M^-1 only products with it from both sides are wanted: one half of its factors is enough.
         half = _half_solved(self._known + latter.matrix, columns)
         matrix -= half[:, :-1].T @ half[:, :-1]
@@ -222,10 +226,15 @@ def _read_only(matrix: Array, vector: Array) -> Evidence:
 
 
 def _half_solved(matrix: Array, columns: Array) -> Array:
-    """Return L^-1 columns of a matrix L L^T."""
+    """Return L^-1 columns of a matrix L L^T.
+
+    By LAPACK itself: most matrices are small, and `scipy.linalg` takes ten times as long for what is around.
+    """
     # It is symmetric; transposed it is laid out as LAPACK has its matrices, and is not copied.
-    factor = cholesky(matrix.T, lower=True, check_finite=False)
-    return np.asarray(solve_triangular(factor, columns, lower=True, check_finite=False))
+    factor, failed = dpotrf(matrix.T, lower=True, clean=False)
+    if failed:
+        raise np.linalg.LinAlgError(f"a matrix of {len(matrix)} rows is not positive definite")
+    return np.asarray(dtrtrs(factor, columns, lower=True)[0])
 
 
 def _best_changes(matrices: Array, vectors: Array, likely: Array) -> list[Change]:

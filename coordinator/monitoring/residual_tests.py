@@ -32,7 +32,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from coordinator.batch_estimation.imu_intrinsics import DELAY, SIZE, ImuIntrinsics, mixing, read, slopes
-from coordinator.batch_estimation.imu_jacobian import imu_jacobian
+from coordinator.batch_estimation.imu_jacobian import imu_jacobian, kernel_motion
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
     ImuReadings,
@@ -232,13 +232,13 @@ def imu_evidence(model: ImuModel, segment: DataSegment) -> Evidence:
     tilt = links + _PER_TWIST * count
     total = links + len(model.prior_sigma)
     matrix, vector = np.zeros((total, total)), np.zeros(total)
-    free = np.ones(SIZE, dtype=bool)
+    motion = kernel_motion(bodies, at.q_rad, at.qd_rad_s)
+    by_errors = slopes(ideal.gyro_rad_s, ideal.accel_m_s2, at.imu_rates, np.ones(SIZE, dtype=bool))
     for k in range(count):
-        moved = imu_jacobian(model.chain, bodies, at.q_rad, at.qd_rad_s, k)
-        mixed = mixing(model.intrinsics, k)
-        by_error = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], at.imu_rates[:, k], free)
+        moved = imu_jacobian(model.chain, motion, len(at.q_rad), k, mixing(model.intrinsics, k))
+        by_error = by_errors[:, :, k]
         # Slopes (p, 6, m) by those parameters alone that this IMU depends on.
-        own = np.concatenate([by_error[_OWN], mixed @ moved.poses, mixed @ moved.gravity, by_error[_LASTING]])
+        own = np.concatenate([by_error[_OWN], moved.poses, moved.gravity, by_error[_LASTING]])
         columns = np.concatenate(
             [
                 len(_OWN) * k + np.arange(len(_OWN)),

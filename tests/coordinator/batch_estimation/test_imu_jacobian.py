@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coordinator.batch_estimation.estimator import with_placement
-from coordinator.batch_estimation.imu_jacobian import imu_jacobian
+from coordinator.batch_estimation.imu_jacobian import imu_jacobian, kernel_motion
 from coordinator.batch_estimation.imu_prediction import body_motions, imu_readings
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import apply_perturbation
@@ -31,7 +31,7 @@ def _analytic(chain: Chain, motion: tuple[Array, Array, Array]) -> Array:
     found = np.zeros((6 * joints + 3, samples, joints, 6))
     bodies = body_motions(chain, *motion)
     for k in range(joints):
-        slopes = imu_jacobian(chain, bodies, *motion[:2], k)
+        slopes = imu_jacobian(chain, kernel_motion(bodies, *motion[:2]), len(motion[0]), k)
         rows = np.concatenate([6 * module + np.arange(6) for module in slopes.modules])
         found[rows, :, k] = np.swapaxes(slopes.poses, 1, 2)
         found[-3:, :, k] = np.swapaxes(slopes.gravity, 1, 2)
@@ -76,7 +76,7 @@ def test_slopes_by_the_placement_of_an_imu_are_the_differences_of_its_readings(
         step[k, unit] = STEP
         ahead, behind = (_read(with_placement(chain, sign * step), motion) for sign in (1.0, -1.0))
         expected = (ahead - behind)[:, k] / (2 * STEP)
-        found = imu_jacobian(chain, bodies, *motion[:2], k).placement[unit].T
+        found = imu_jacobian(chain, kernel_motion(bodies, *motion[:2]), len(motion[0]), k).placement[unit].T
         np.testing.assert_allclose(found, expected, atol=2e-7)
 
 
@@ -97,7 +97,10 @@ def test_an_imu_feels_the_joints_below_it_and_its_own_module_only(robots: Any) -
         while joint >= 0:
             moved_by.add(joint)
             joint = chain.parent[joint]
-        assert set(imu_jacobian(chain, bodies, *motion[:2], k).modules) == moved_by
+        assert (
+            set(imu_jacobian(chain, kernel_motion(bodies, *motion[:2]), len(motion[0]), k).modules)
+            == moved_by
+        )
 
 
 @pytest.mark.parametrize("seed", range(4))

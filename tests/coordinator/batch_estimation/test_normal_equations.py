@@ -70,8 +70,9 @@ def _dense(problem: Problem, state: State, joints: Joints, sigmas: list[Array]) 
         )
         for unit in np.eye(links)
     ]
+    motion = kernel_motion(bodies, *joints[:2])
     for k in range(count):
-        one, mixed = imu_jacobian(state.chain, bodies, *joints[:2], k), mixing(state.imus, k)
+        one, mixed = imu_jacobian(state.chain, motion, len(joints[0]), k), mixing(state.imus, k)
         rates = problem.data.imu_rates
         assert rates is not None
         for place, module in enumerate(one.modules):
