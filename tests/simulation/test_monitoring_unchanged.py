@@ -2,7 +2,9 @@
 
 import pytest
 
-from coordinator.monitoring.monitor import Monitor, MonitorUpdate
+from coordinator.monitoring.monitor import WORST_CLOCK_NS, Monitor, MonitorUpdate
+from coordinator.recording.recording import Recording
+from module_agent.signals.clock_map import ClockMap
 from sim.benchmark.cases.monitored_robot import WorldEvent, monitor_robot
 from sim.benchmark.cases.monitoring import (
     Alarms,
@@ -42,6 +44,25 @@ def test_a_poor_network_is_named_and_nothing_is_concluded_from_what_it_leaves() 
     monitor, notes = notes_of(ARM._replace(network="bad"), 12.0)
     assert monitor.finding_log.all == ()
     assert any("the network is slow" in note for note in notes)
+
+
+def test_whose_clock_is_slow_is_said_once_and_again_when_it_is_not() -> None:
+    known = known_subject(ARM)
+    monitor, (first, *others) = Monitor(known.reference), known.robot.serials
+    accurate = ClockMap(0, 0.0, 0.0, sigma_ns=0.1 * WORST_CLOCK_NS)
+    slow = accurate._replace(sigma_ns=2.5 * WORST_CLOCK_NS)
+
+    def said(of_first: ClockMap) -> list[str]:
+        clocks = dict.fromkeys(others, accurate) | {first: of_first}
+        return [note for note in monitor.advance(Recording(), clocks).notes if "feedback" not in note]
+
+    assert said(accurate) == []
+    assert said(slow) == [
+        f"the network is slow: when {first} read what they say is known to 2.5 ms only, and 1.0 ms are "
+        "needed; only friction is watched, each drive by itself"
+    ]
+    assert said(slow) == []
+    assert said(accurate) == ["all clocks are accurate again: the tests go on"]
 
 
 def test_rates_have_the_interval_of_poisson() -> None:

@@ -57,6 +57,25 @@ def far(one: JointInformation, other: JointInformation) -> float:
     )
 
 
+@pytest.mark.parametrize("samples", [7, 700])
+def test_a_constant_torque_of_each_joint_is_one_more_column(samples: int) -> None:
+    """One joint after the other, by its own rows; 700 samples are several blocks."""
+    rng = default_rng(samples)
+    chain = random_tree(rng, 4)
+    q, qd, qdd, tau = motion(rng, samples, 4)
+    together = gather(chain, q, qd, qdd, tau, with_offset=True)
+    for joint, found in enumerate(together):
+        own = gather_joint(chain, joint, q, qd, qdd, tau[:, joint], further=np.ones((samples, 1)))
+        assert found.r.shape[1] == 10 * 4 + 1
+        assert far(found, own) < EXACT
+    # The offset is found where it is, and the bodies' parameters are those of torques without it.
+    phi, offset_nm = rng.normal(size=40), np.array([0.5, -0.2, 0.1, 0.3])
+    tau = torque_regressor(chain, q, qd, qdd) @ phi + offset_nm
+    for joint, found in enumerate(gather(chain, q, qd, qdd, tau, with_offset=True)):
+        misfit = found.r @ np.append(phi, offset_nm[joint]) - found.z
+        assert np.abs(misfit).max() < 1e-9
+
+
 @settings(deadline=None, max_examples=25)
 @given(st.integers(1, 6), st.integers(0, 2**32 - 1))
 def test_a_joint_alone_gathers_what_all_together_gather_of_it(joints: int, seed: int) -> None:
