@@ -9,6 +9,7 @@ seed is a number is the same in all of its lives, which differ in their day: noi
 import time
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import islice
 from statistics import median
 from typing import Literal, NamedTuple
 
@@ -244,7 +245,7 @@ def known_robot_of(
     task = excitation_task(known.chain, modules, plan)._replace(segment_s=MOTION_S)
     rng = np.random.default_rng((seed, 0x307105))
     drawn = (draw_possible(task, rng) for _ in range(_DRAWS))
-    segments = [one for one in drawn if isinstance(one, Segment)][:MOTIONS]
+    segments = islice((one for one in drawn if isinstance(one, Segment)), MOTIONS)
     serials = known.chain.serials
     motions = tuple(
         RobotMotion(
