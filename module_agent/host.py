@@ -282,8 +282,6 @@ class AgentHost:
     def _cycle_on_bus(self, bus: BusRun, busy: list[int]) -> None:
         assert self._quiet is not None
         results = bus.run(busy, 1 if busy or self.has_work else MANY_TICKS)
-        if NOT_QUIET in results or self.has_work:
-            self._quiet.keep_held()
         self.finish(bus.readings, results)
 
     def collect(self) -> list[int]:
@@ -296,8 +294,10 @@ class AgentHost:
 
     def finish(self, readings: Readings, results: Sequence[int]) -> None:
         """Run what quiet ticks have left of a tick: modules that need their objects, and all that is sent."""
-        quiet = self._quiet
+        quiet, places = self._quiet, range(self._place, self._place + len(self.modules))
         assert quiet is not None
+        if self.has_work or any(results[place] == NOT_QUIET for place in places):
+            quiet.keep_held(places)
         if self._from_others.waiting:
             # Their times are those of the last tick until the modules are run.
             for place, module in enumerate(self.modules, self._place):

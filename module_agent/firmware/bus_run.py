@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from module_agent.firmware import run_kernel, tick_kernel
 from module_agent.firmware.quiet_ticks import QuietTicks
-from module_agent.firmware.run_kernel import keep_rows, keep_times
-from module_agent.firmware.tick_kernel import QUIET, ROW_DUE
+from module_agent.firmware.run_kernel import keep_rows, keep_times, settle_rows
 from module_agent.hardware import bus_client, packet_kernel
 from module_agent.hardware.bus_client import BusClient, answer, receive
 from module_agent.hardware.hardware import Readings
@@ -47,8 +46,6 @@ class BusRun:
 
     def run(self, busy: list[int], most: int) -> list[int]:
         """Run at least one tick and at most so many; return the results of the last as `QuietTicks.run`.
-
-        `ROW_DUE` says that a batch is complete; other rows are held, see `QuietTicks.keep_held`.
 
         Raises:
             HardwareLost: no further tick will come.
@@ -83,9 +80,5 @@ def _run(
         if ends or bell[0]:
             answer(bus, next_pwm)
             break
-    for i in range(len(results)):
-        if results[i] == ROW_DUE and held[i] < room[i]:
-            results[i] = QUIET
-        elif results[i] == QUIET and held[i] >= room[i]:
-            results[i] = ROW_DUE
+    settle_rows(results, room, held)
     return done

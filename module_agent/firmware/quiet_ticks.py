@@ -12,6 +12,7 @@ import numpy as np
 
 from module_agent.firmware import tick_kernel as kernel
 from module_agent.firmware.firmware import Firmware, Outgoing
+from module_agent.firmware.run_kernel import settle_rows
 from module_agent.firmware.tick_kernel import NOT_QUIET, QUIET, ROW_DUE, Floats
 from module_agent.hardware.hardware import Readings
 from module_agent.hardware.loop_inside import LoopInside
@@ -21,8 +22,8 @@ __all__ = ["NOT_QUIET", "QUIET", "ROW_DUE", "QuietTicks"]
 
 # Milliseconds of motion; a longer one makes more room.
 _SAMPLES = 8192
-# Feedback rows that can wait for Python.
-_HELD_ROWS = 16
+# Feedback rows that can wait for Python: as many as are sent in one message, or more.
+_HELD_ROWS = 64
 
 
 class _Module(NamedTuple):
@@ -88,6 +89,7 @@ class QuietTicks:
         for place in np.flatnonzero(self._results == ROW_DUE).tolist():
             self._held_rows[place, self._held[place]] = self._rows[place : place + 1].view(np.uint8)
             self._held[place] += 1
+        settle_rows(self._results, self._room, self._held)
         return self.end_run()
 
     @property
@@ -121,7 +123,7 @@ class QuietTicks:
     def end_run(self) -> list[int]:
         """End the ticks of a run; return the result of the last for each place, see `tick_kernel`.
 
-        `ROW_DUE` says that a place holds rows, of earlier ticks too.
+        `ROW_DUE` says that the rows of a place complete a batch; others are held, see `keep_held`.
         """
         self.before_ns, self.now_ns = self._times.tolist()
         results: list[int] = self._results.tolist()
@@ -135,10 +137,11 @@ class QuietTicks:
         self._held[place], self._room[place] = 0, min(module.firmware.rows_to_batch, _HELD_ROWS)
         return out
 
-    def keep_held(self) -> None:
-        """Give all modules the rows that they hold of earlier ticks, where these complete no batch."""
-        for place in np.flatnonzero((self._held > 0) & (self._held < self._room)).tolist():
-            self.keep_rows(place)
+    def keep_held(self, places: range) -> None:
+        """Give modules the rows that they hold of earlier ticks, where these complete no batch."""
+        for place in places:
+            if 0 < self._held[place] < self._room[place]:
+                self.keep_rows(place)
 
     def load(self, place: int) -> None:
         """Let the objects of a module go on from where its quiet ticks ended."""

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.firmware import tick_kernel
-from module_agent.firmware.tick_kernel import NOT_QUIET, ROW_DUE, Integers
+from module_agent.firmware.tick_kernel import NOT_QUIET, QUIET, ROW_DUE, Integers
 from module_agent.model.compiled import compiled_with
 
 
@@ -36,3 +36,13 @@ def keep_rows(
         elif results[i] == NOT_QUIET and alive[i]:
             ends = True
     return ends
+
+
+@compiled_with(tick_kernel)
+def settle_rows(results: NDArray[np.uint8], room: Integers, held: Integers) -> None:
+    """Let results say of rows whether they complete a batch, after the last tick of a run."""
+    for i in range(len(results)):
+        if results[i] == ROW_DUE and held[i] < room[i]:
+            results[i] = QUIET
+        elif results[i] == QUIET and held[i] >= room[i]:
+            results[i] = ROW_DUE

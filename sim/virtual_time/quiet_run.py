@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from module_agent.firmware import run_kernel, tick_kernel
 from module_agent.firmware.quiet_ticks import QuietTicks
-from module_agent.firmware.run_kernel import keep_rows, keep_times
-from module_agent.firmware.tick_kernel import QUIET, ROW_DUE
+from module_agent.firmware.run_kernel import keep_rows, keep_times, settle_rows
 from module_agent.model.compiled import compiled_with
 from sim.geometry.pose import Array
 from sim.sensors import alteration
@@ -114,7 +113,5 @@ def _run(
             seen[done, ASKED, i] = next_pwm[i] if alive[i] else pwm[i]
             if alive[i]:
                 pwm[i] = min(max(next_pwm[i], -1.0), 1.0)
-    for i in range(len(pwm)):
-        if results[i] == QUIET and held[i] > 0:
-            results[i] = ROW_DUE
+    settle_rows(results, room, held)
     return done

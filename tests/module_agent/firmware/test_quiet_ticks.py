@@ -139,6 +139,8 @@ class Agent:
     @property
     def everything(self) -> tuple[Any, ...]:
         """What can be seen of the agent from outside, and the state of its firmwares."""
+        if self.host._quiet is not None:
+            self.host._quiet.keep_held(range(len(self.host.modules)))
         states = [module.firmware.state for module in self.host.modules]
         rows = [
             module.firmware.history.block(0, module.firmware.history.next_row) for module in self.host.modules
