@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.batch_estimation.imu_kernel import LANES, Path, fill_slopes
-from coordinator.batch_estimation.imu_prediction import BodyMotion
+from coordinator.batch_estimation.imu_prediction import BodyMotion, stacked
 from module_agent.model.chain import Array, Chain
 
 Index = NDArray[np.int64]
@@ -74,7 +74,7 @@ class Motion(NamedTuple):
 def kernel_motion(bodies: Sequence[BodyMotion], q_rad: Array, qd_rad_s: Array) -> Motion:
     """Return bodies (`body_motions`) and joints (m, n) as the kernels take them."""
     signals = np.stack([np.sin(q_rad.T), np.cos(q_rad.T), qd_rad_s.T])
-    return Motion(padded(np.stack([np.concatenate(body) for body in bodies])), padded(signals))
+    return Motion(padded(stacked(bodies)), padded(signals))
 
 
 def padded(signals: Array) -> Array:

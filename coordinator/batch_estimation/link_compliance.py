@@ -8,7 +8,6 @@ one for twisting to be estimated. Without it a link that gives by 1 % is estimat
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +29,6 @@ from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import HINGE_SHARE, HINGE_SHARE_SIGMA
 from module_agent.model.perturbation import cross
-from module_agent.model.read_only import read_only
 from module_agent.signals.filtering import differentiate
 
 # Sigma of the hinge's distance from the line between the faces: tubes are centimetres off the modules' axes.
@@ -43,6 +41,10 @@ _ROUNDS = 2
 # A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: only
 # the product of load and compliance is observable.
 LINK_MASS_KG, LINK_MASS_KG_M = 0.2, 0.4
+
+
+# No link has this direction, which is none of an axis or a diagonal; sideways is relative to it.
+_NO_LINK = np.array([0.557, -0.309, 0.771])
 
 
 class LinkLoad(NamedTuple):
@@ -71,14 +73,13 @@ class LinkLoad(NamedTuple):
 
     @property
     def shifts(self) -> Array:
-        """Unit shifts (3, 3) of the hinge: by the link's length along it, and by a metre to either side."""
-        return np.vstack([self.length_m * self.along, _aside(tuple(self.along.tolist()))])
+        """Unit shifts (3, 3) of the hinge: by the link's length along it, and by a metre to either side.
 
-
-@lru_cache(maxsize=1024)
-def _aside(along: tuple[float, ...]) -> Array:
-    """Return two unit directions across one, (2, 3): the same ones each time, as estimates are about them."""
-    return read_only(np.linalg.svd(np.array(along)[None])[2][1:])
+        They change little with the link's direction: estimates by one chain are used with refined ones.
+        """
+        aside = np.cross(_NO_LINK, self.along)
+        aside /= max(float(np.linalg.norm(aside)), 1e-9)
+        return np.vstack([self.length_m * self.along, aside, np.cross(self.along, aside)])
 
 
 def link_loads(

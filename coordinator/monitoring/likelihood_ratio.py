@@ -24,7 +24,6 @@ With h = B^T b + L^T l the change of one hypothesis has, theta eliminated (Schur
 """
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -131,32 +130,32 @@ class ChangeTest:
         prior_sigma: ArrayLike,
         changes: Sequence[Array],
         likely: Sequence[float] | None = None,
-        inflation: float = 1.0,
     ):
         """Take what is known before.
 
         Args:
             before: about p parameters, as deviations from where a first model has them.
             prior_sigma: (p,) how far a parameter may be from there, before anything was measured.
-            changes: per hypothesis about what changed the matrix (p, d) from its own parameters to the change
-                of theta, in units in which a change of 1 is large: there is a prior of that size on them.
+            changes: per hypothesis about what changed the matrix (p, d) from its own parameters, d of each
+                hypothesis, to the change of theta, in units in which a change of 1 is large: there is a prior
+                of that size on them.
             likely: per hypothesis how large changes are by which it is judged: its gain is that under a prior
                 of this size, its size and covariance are those under a prior of 1; None for 1 of all.
-            inflation: later evidence is tempered by that.
 
         Raises:
-            ValueError: evidence about other parameters.
+            ValueError: evidence about other parameters, or shapes that do not fit.
         """
         self._sigma = np.asarray(prior_sigma, dtype=float)
         self._before = self._scaled(before)
         self._known = self._before.matrix + np.eye(len(self._sigma))
-        self._inflation = inflation
-        self._widths = [change.shape[1] for change in changes]
         # A robot without links has no link that could have changed.
-        wide = np.column_stack([*changes, np.zeros((len(self._sigma), 0))]) / self._sigma[:, None]
+        each = np.stack(changes) if changes else np.zeros((0, len(self._sigma), 1))
+        self._likely = np.ones(len(each)) if likely is None else np.array(likely, dtype=float)
+        if self._likely.shape != (len(each),):
+            raise ValueError(f"{len(each)} hypotheses are judged by {self._likely.size} likely sizes")
+        self._places = np.arange(each.shape[0] * each.shape[2]).reshape(-1, each.shape[2])
         # Sparse: of all parameters each change touches a few.
-        self._wide = csr_array(wide.T)
-        self._likely = np.asarray(likely or np.ones(len(changes)), dtype=float)
+        self._wide = csr_array((np.swapaxes(each, 1, 2) / self._sigma).reshape(-1, len(self._sigma)))
 
     def find(self, later: Evidence) -> tuple[Change, ...]:
         """Return the best change of every hypothesis about what changed since.
@@ -164,8 +163,8 @@ class ChangeTest:
         Raises:
             ValueError: evidence about other parameters.
         """
-        latter = self._scaled(later, self._inflation)
-        columns = np.empty((len(self._sigma), sum(self._widths) + 1), order="F")
+        latter, own = self._scaled(later), self._places
+        columns = np.empty((len(self._sigma), own.size + 1), order="F")
         columns[:, :-1] = (self._wide @ latter.matrix).T
         columns[:, -1] = self._before.vector + latter.vector
         matrix, vector = self._wide @ columns[:, :-1], self._wide @ latter.vector
@@ -173,15 +172,7 @@ class ChangeTest:
         half = _half_solved(self._known + latter.matrix, columns)
         matrix -= half[:, :-1].T @ half[:, :-1]
         vector -= half[:, :-1].T @ half[:, -1]
-        found: list[Change] = []
-        first = 0
-        for width, group in groupby(self._widths):
-            count = len(list(group))
-            own = (first + np.arange(width * count)).reshape(count, width)
-            likely = self._likely[len(found) : len(found) + count]
-            found += _best_changes(matrix[own[:, :, None], own[:, None]], vector[own], likely)
-            first += width * count
-        return tuple(found)
+        return _best_changes(matrix[own[:, :, None], own[:, None]], vector[own], self._likely)
 
     def misfit(self, later: Evidence) -> float:
         """Return what there is to explain: by how much [variances] two robots fit better than one, each with
@@ -190,7 +181,7 @@ class ChangeTest:
         Raises:
             ValueError: evidence about other parameters.
         """
-        unit, latter = np.eye(len(self._sigma)), self._scaled(later, self._inflation)
+        unit, latter = np.eye(len(self._sigma)), self._scaled(later)
         robots = [
             (self._known, self._before.vector),
             (latter.matrix + unit, latter.vector),
@@ -199,12 +190,11 @@ class ChangeTest:
         first, second, both = (float(np.sum(_half_solved(m, v[:, None]) ** 2)) for m, v in robots)
         return first + second - both
 
-    def _scaled(self, one: Evidence, inflation: float = 1.0) -> Evidence:
-        """Return tempered evidence about parameters in standard deviations of their prior."""
+    def _scaled(self, one: Evidence) -> Evidence:
+        """Return evidence about parameters in standard deviations of their prior."""
         if one.parameters != self._sigma.size:
             raise ValueError(f"evidence about {one.parameters} parameters, prior of {self._sigma.size}")
-        less = self._sigma / inflation
-        return Evidence(less[:, None] * one.matrix * self._sigma, less * one.vector)
+        return Evidence(self._sigma[:, None] * one.matrix * self._sigma, self._sigma * one.vector)
 
 
 def most_of(changes: Sequence[Change]) -> int:
@@ -230,14 +220,14 @@ def _half_solved(matrix: Array, columns: Array) -> Array:
 
     By LAPACK itself: most matrices are small, and `scipy.linalg` takes ten times as long for what is around.
     """
-    # It is symmetric; transposed it is laid out as LAPACK has its matrices, and is not copied.
+    # It is symmetric, and transposed laid out as LAPACK has its matrices. A copy: it may be shared.
     factor, failed = dpotrf(matrix.T, lower=True, clean=False)
     if failed:
         raise np.linalg.LinAlgError(f"a matrix of {len(matrix)} rows is not positive definite")
     return np.asarray(dtrtrs(factor, columns, lower=True)[0])
 
 
-def _best_changes(matrices: Array, vectors: Array, likely: Array) -> list[Change]:
+def _best_changes(matrices: Array, vectors: Array, likely: Array) -> tuple[Change, ...]:
     """Return the best changes of k hypotheses by their S - 1 (k, d, d) and r (k, d)."""
     unit = np.eye(vectors.shape[1])
     covariances = np.linalg.inv(matrices + unit)
@@ -245,4 +235,4 @@ def _best_changes(matrices: Array, vectors: Array, likely: Array) -> list[Change
     judged = np.linalg.solve(matrices + unit / likely[:, None, None] ** 2, vectors[..., None])[..., 0]
     gains = np.vecdot(vectors, judged)
     make_read_only((best, covariances))
-    return [Change(float(gain), *one) for gain, *one in zip(gains, best, covariances, strict=True)]
+    return tuple(Change(float(gain), *one) for gain, *one in zip(gains, best, covariances, strict=True))

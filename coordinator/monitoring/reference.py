@@ -128,11 +128,11 @@ class BaselineTest:
 
     def find(self, later: Evidence) -> tuple[Change, ...]:
         """Test the evidence of a later window, about all parameters."""
-        return self._test.find(later)
+        return self._test.find(tempered(later, self.inflation))
 
     def misfit(self, later: Evidence) -> float:
         """Return what there is to explain of a later window, as gains are."""
-        return self._test.misfit(later)
+        return self._test.misfit(tempered(later, self.inflation))
 
     @cached_property
     def _test(self) -> ChangeTest:
@@ -140,7 +140,7 @@ class BaselineTest:
         own, sigma = self.own_sigma.size, np.concatenate([self.own_sigma, self.prior_sigma])
         before = Evidence(np.zeros((sigma.size, sigma.size)), np.zeros(sigma.size))
         before.matrix[own:, own:], before.vector[own:] = self.evidence.matrix, self.evidence.vector
-        return ChangeTest(before, sigma, self.changes, self.likely, self.inflation)
+        return ChangeTest(before, sigma, self.changes, self.likely)
 
 
 class Reference(NamedTuple):

@@ -74,14 +74,15 @@ def torque_sensor_error(test: BaselineTest, parts: Sequence[Evidence]) -> Sensor
     hypotheses = np.zeros((joints, later.parameters, SENSOR_ERRORS))
     for change, own in zip(hypotheses, columns, strict=True):
         change[own, np.arange(SENSOR_ERRORS)] = _TORQUE_SIZES
-    changes = replace(test, own_sigma=np.full(count, _FIXED), changes=tuple(hypotheses)).find(later)
+    rival = replace(test, own_sigma=np.full(count, _FIXED), changes=tuple(hypotheses), likely=None)
+    changes = rival.find(later)
     index = most_of(changes)
     return _sensor_error("torque-sensor", index, changes[index], later, columns[index], _TORQUE_SIZES)
 
 
 def drive_offset(test: BaselineTest, model: DriveModel, joint: int, later: Evidence) -> SensorError:
     """Return what an offset of a joint's torque sensor explains of its drive (`drive_evidence`)."""
-    change = replace(test, changes=(model.offset_change,)).find(later)[0]
+    change = replace(test, changes=(model.offset_change,), likely=None).find(later)[0]
     # The hypothesis has one parameter, which moves the offset alone.
     unit_nm = float(model.offset_change.max())
     error, sigma = abs(float(change.size[0])), float(np.sqrt(change.covariance[0, 0]))

@@ -4,7 +4,8 @@ The model is that of `joint_model`. What no motion of this joint determines keep
 (`ImuPrior`), which enters the covariance of the result.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -133,6 +134,8 @@ class _Equations(NamedTuple):
     noise: Array
 
 
+# Of a covariance's largest eigenvalue; and of a distance the standard deviation that messages hold.
+_ROUNDING, _MAX_SIGMA_M = 1e-9, 1e3
 _DIVERGES = "the fit diverges: no motion of the joint explains what the IMU read, is it sick?"
 
 
@@ -155,15 +158,12 @@ def regress_joint(
             readings no motion of the joint explains.
     """
     problem, guess = _problem(motions, rest, knowledge)
-    # A sensor at the end of its range can take the fit anywhere, also to where variances are negative.
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            state, covariance = _minimise(problem, guess)
-            systematic = _systematic(state, covariance, problem, symmetric_load)
-            found = _result(state, covariance, problem, systematic)
-    except np.linalg.LinAlgError as error:
-        raise DataError(_DIVERGES) from error
-    if not np.isfinite([*found.covariance.flat, found.sigma_axis_rad, found.sigma_distance_m]).all():
+    state, covariance = _minimise(problem, guess)
+    with _diverging():
+        found = _result(state, covariance, problem, _systematic(state, covariance, problem, symmetric_load))
+        # What is singular along the axis has an eigenvalue of zero, give or take its rounding.
+        least, *_, largest = np.linalg.eigvalsh(found.covariance)
+    if not (least >= -_ROUNDING * largest and found.sigma_distance_m < _MAX_SIGMA_M):
         raise DataError(_DIVERGES)
     return found
 
@@ -187,22 +187,41 @@ def distance_bound_m(
     normal = _equations(problem, state, np.array(noise)).normal
     known = np.arange(len(normal)) != HINGE
     covariance = np.zeros_like(normal)
-    covariance[np.ix_(known, known)] = np.linalg.inv(normal[np.ix_(known, known)])
+    with _diverging():
+        covariance[np.ix_(known, known)] = np.linalg.inv(normal[np.ix_(known, known)])
     return _result(state, covariance, problem, np.zeros((6, 6))).sigma_distance_m
 
 
 def _minimise(problem: _Problem, state: _State) -> tuple[_State, Array]:
-    """Return the optimum of the fit, and the covariance of the parameters."""
+    """Return the optimum of the fit, and the covariance of the parameters.
+
+    Raises:
+        DataError: there is none, or its variances are not positive.
+    """
     noise = np.array([1e-3, 2e-2])
-    for _ in range(ITERATIONS):
-        at = _equations(problem, state, noise)
-        step = np.asarray(np.linalg.solve(at.normal, at.gradient), dtype=np.float64)
-        state, noise = _moved(state, step), at.noise
-        if np.all(np.abs(step) * np.sqrt(np.diag(at.normal)) <= SETTLED):
-            break
-    end = _equations(problem, state, noise)
-    inverse = np.linalg.inv(end.normal)
-    return state, inverse @ end.scatter @ inverse.T
+    with _diverging():
+        for _ in range(ITERATIONS):
+            at = _equations(problem, state, noise)
+            step = np.asarray(np.linalg.solve(at.normal, at.gradient), dtype=np.float64)
+            state, noise = _moved(state, step), at.noise
+            if np.all(np.abs(step) * np.sqrt(np.diag(at.normal)) <= SETTLED):
+                break
+        end = _equations(problem, state, noise)
+        inverse = np.linalg.inv(end.normal)
+        covariance = inverse @ end.scatter @ inverse.T
+    if not (np.isfinite(covariance).all() and (np.diag(covariance) >= 0.0).all()):
+        raise DataError(_DIVERGES)
+    return state, covariance
+
+
+@contextmanager
+def _diverging() -> Iterator[None]:
+    """Say so where a fit diverges: a sensor at the end of its range can take it anywhere."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
+    except np.linalg.LinAlgError as error:
+        raise DataError(_DIVERGES) from error
 
 
 def _problem(

@@ -13,11 +13,13 @@ from coordinator.batch_estimation.imu_prediction import (
     given,
     imu_readings,
     readings_on,
+    turned,
 )
 from coordinator.batch_estimation.link_compliance import (
     LINK_MASS_KG,
     LINK_MASS_KG_M,
     UNIT_RAD_NM,
+    LinkLoad,
     compliance_jacobian,
     hinge_slopes,
     joined,
@@ -147,6 +149,62 @@ def test_at_rest_a_link_carries_the_weight_of_all_modules_and_links_beyond(robot
         np.testing.assert_allclose(load.force[0], np.tile(force, (20, 1)).T, atol=1e-9)
         np.testing.assert_allclose(load.moment[0], np.tile(moment, (20, 1)).T, atol=1e-9)
         assert np.abs(load.moment[1:]).max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_loads_and_readings_of_moving_trees_are_those_of_the_formulas(robots: Any, seed: int) -> None:
+    """Modules mounted reversed, links that turn below any of them; body by body, without compiled code."""
+    chain, types = robots.random(seed, 6, serial=False)
+    rng = np.random.default_rng(seed)
+    q, *others = 1.5 * rng.normal(size=(40, 6)), *rng.normal(size=(2, 40, 6))
+    turns = {k: [LinkTurn(*_turn(rng))] for k in range(6)}
+    assert any(chain.reversed)
+    bodies = body_motions(chain, q, *others, turns=turns)
+    loads = link_loads(chain, types, bodies, q, RATE_HZ, turns)
+    ideal = readings_on(chain, bodies, turns)
+    forces = [np.zeros((3, 40)) for _ in range(6)]
+    for k in reversed(range(6)):
+        home = chain.imu_home[k]
+        beyond = given(bodies[chain.parent[k]], turns[k])
+        own = bodies[k] if chain.reversed[k] else beyond
+        np.testing.assert_allclose(ideal.gyro_rad_s[:, k], own.omega.T @ home[:3, :3], atol=1e-12)
+        force = acceleration_at(own, home[:3, 3, None]).T @ home[:3, :3]
+        np.testing.assert_allclose(ideal.accel_m_s2[:, k], force, atol=1e-11)
+        com = home[:3, :3] @ (np.array(types[k].com_xyz) - np.array(types[k].imu_xyz)) + home[:3, 3]
+        weight = -types[k].mass_kg * acceleration_at(own, com[:, None])
+        if chain.reversed[k]:
+            forces[k] = forces[k] + weight
+        load = loads[k]
+        if load is None:
+            assert k not in chain.linked
+            continue
+        begin, end = link_ends(chain, types, k)
+        link_kg = LINK_MASS_KG + LINK_MASS_KG_M * float(np.linalg.norm(end - begin))
+        below = turned(chain.axis[k], q[:, k], forces[k])
+        below -= link_kg * acceleration_at(beyond, (0.5 * (begin + end))[:, None])
+        if not chain.reversed[k]:
+            below += weight
+        np.testing.assert_allclose(load.force[0], below, atol=1e-10)
+        forces[chain.parent[k]] = forces[chain.parent[k]] + below
+
+
+def test_where_a_hinge_is_hardly_changes_with_the_direction_of_its_link(robots: Any) -> None:
+    """What one fit finds of it is used with the chain of the next. Links along all axes, and any other."""
+    any_one = next(load for load in _still_loads(robots) if load is not None)
+    rng = np.random.default_rng(1)
+    for along in (*np.eye(3), *-np.eye(3), *rng.normal(size=(20, 3))):
+        shifts = []
+        for change in rng.normal(size=(10, 3)) * 1e-6:
+            direction = along + change
+            shifts.append(any_one._replace(along=direction / np.linalg.norm(direction), length_m=1.0).shifts)
+        assert np.ptp(shifts, axis=0).max() < 1e-4
+        np.testing.assert_allclose(shifts[0] @ shifts[0].T, np.eye(3), atol=1e-12)
+
+
+def _still_loads(robots: Any) -> list[LinkLoad | None]:
+    chain, types = robots.random(1, 3, serial=True)
+    still = np.zeros((20, 3))
+    return link_loads(chain, types, body_motions(chain, still, still, still), still, RATE_HZ)
 
 
 def test_loads_change_as_their_derivatives_say(robots: Any) -> None:

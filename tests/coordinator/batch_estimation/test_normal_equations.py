@@ -73,6 +73,10 @@ def _dense(problem: Problem, state: State, joints: Joints, sigmas: list[Array]) 
     motion = kernel_motion(bodies, *joints[:2])
     for k in range(count):
         one, mixed = imu_jacobian(state.chain, motion, len(joints[0]), k), mixing(state.imus, k)
+        # Slopes of the readings of an IMU with errors are those, mixed.
+        errs = imu_jacobian(state.chain, motion, len(joints[0]), k, mixed)
+        for with_errors, perfect in zip(errs[1:], one[1:], strict=True):
+            np.testing.assert_allclose(with_errors, mixed @ perfect, atol=1e-10)
         rates = problem.data.imu_rates
         assert rates is not None
         for place, module in enumerate(one.modules):

@@ -54,6 +54,29 @@ def test_gain_and_size_are_those_of_least_squares_over_all_samples_at_once(rng: 
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8)
 
 
+def test_several_hypotheses_are_judged_each_by_itself_and_by_its_own_size(rng: Generator) -> None:
+    """Of two parameters each, each as large as is likely of it."""
+    theta = rng.normal(size=PARAMETERS)
+    before, later = (evidence_of(*measured(rng, theta + shift)) for shift in (0.0, 0.3))
+    changes = tuple(np.eye(PARAMETERS)[:, k : k + 2] * 100.0 for k in range(4))
+    likely = (1.0, 1e-3, 5e-3, 0.1)
+    together = ChangeTest(before, WIDE, changes, likely).find(later)
+    for change, size, found in zip(changes, likely, together, strict=True):
+        # A prior of another size is one of 1 in other units, and sizes are those under a prior of 1.
+        judged = ChangeTest(before, WIDE, (size * change,)).find(later)[0]
+        measured_by_itself = ChangeTest(before, WIDE, (change,)).find(later)[0]
+        assert found.gain == pytest.approx(judged.gain, rel=1e-9)
+        np.testing.assert_allclose(found.size, measured_by_itself.size, rtol=1e-9)
+        np.testing.assert_allclose(found.covariance, measured_by_itself.covariance, rtol=1e-9)
+    assert len({round(found.gain, 3) for found in together}) == len(together)
+
+
+def test_hypotheses_and_their_likely_sizes_are_as_many(rng: Generator) -> None:
+    evidence = evidence_of(*measured(rng, rng.normal(size=PARAMETERS)))
+    with pytest.raises(ValueError, match="1 hypotheses are judged by 2 likely sizes"):
+        ChangeTest(evidence, WIDE, (CHANGE,), (1.0, 0.1))
+
+
 def test_chance_exceeds_a_level_as_seldom_as_was_asked_for(rng: Generator) -> None:
     theta = rng.normal(size=PARAMETERS)
     test = ChangeTest(evidence_of(*measured(rng, theta, 2000)), WIDE, (CHANGE,))

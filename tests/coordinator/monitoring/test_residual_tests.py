@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from coordinator.batch_estimation.imu_intrinsics import SIZE, ImuIntrinsics, read
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import estimated_turns
 from coordinator.monitoring.likelihood_ratio import Change, joined, most_of, without_own
@@ -25,6 +26,7 @@ from coordinator.monitoring.residual_tests import (
 )
 from coordinator.monitoring.segments import DataSegment
 from module_agent.model.chain import Array, Chain
+from module_agent.model.perturbation import apply_perturbation
 from tests.coordinator.monitoring.moving_arm import (
     ACCEL_SIGMA,
     CHAIN,
@@ -263,6 +265,29 @@ def test_an_arm_that_hardly_moves_has_no_link_displaced_by_half_a_metre() -> Non
     # Of any size, a displacement explains it.
     assert max(one.gain for one in link_test(MODEL, segments(1, 40), LARGE).find(later)) > ALARM
     assert max(one.gain for one in link_test(MODEL, segments(1, 40)).find(later)) < ALARM
+
+
+def test_slopes_are_those_of_what_imus_with_errors_read() -> None:
+    """IMUs off by some percent, whose modules are displaced by a thousandth: evidence is that of a line."""
+    rng = np.random.default_rng(6)
+    errors = np.zeros((JOINTS, SIZE))
+    errors[:, :18] = 0.05 * rng.normal(size=(JOINTS, 18))
+    model = MODEL._replace(intrinsics=ImuIntrinsics(errors))
+    one = segments(2, 1)[0]
+    joints = one.q_rad, one.qd_rad_s, one.qdd_rad_s2
+    delta = 1e-4 * rng.normal(size=6 * JOINTS)
+
+    def vector(chain: Chain) -> Array:
+        ideal = readings_on(chain, body_motions(chain, *joints))
+        gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
+        return imu_evidence(model, one._replace(gyro_rad_s=gyro, accel_m_s2=accel)).vector
+
+    own = len(model.own_sigma)
+    matrix = imu_evidence(model, one).matrix
+    change = matrix[:, own : own + 6 * JOINTS] @ delta
+    found = vector(apply_perturbation(CHAIN, delta)) - vector(CHAIN)
+    # What is left is the square of the displacement.
+    np.testing.assert_allclose(found, change, rtol=0.0, atol=2e-3 * np.abs(change).max())
 
 
 def test_what_imus_read_near_the_ends_of_a_stretch_has_no_say() -> None:
