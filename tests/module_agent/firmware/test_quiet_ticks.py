@@ -483,3 +483,16 @@ def test_the_kernels_constants_are_those_of_the_objects() -> None:
     bounds = motor_guard.Bounds._fields
     assert tick_kernel.MODULE.names[-len(bounds) :] == bounds
     assert len(SensorSample._fields) == tick_kernel.COLUMNS
+
+
+def test_where_something_is_to_be_done_the_rows_of_all_ticks_are_there() -> None:
+    """Estimates are made of them: those of quiet ticks do not wait for their batch then."""
+    agents = [Agent(is_compiled, 3, "hold", 250.0) for is_compiled in (False, True)]
+    life = Life(agents, 3)
+    for _ in range(30):
+        life.ticks(3)
+        for agent in agents:
+            agent.host._from_others.put(Sample("x5/somebody", b""))
+        life.ticks(1)
+        plain, compiled = ([m.firmware.history.next_row for m in a.host.modules] for a in agents)
+        assert compiled == plain
