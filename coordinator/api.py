@@ -31,7 +31,7 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import await_modules
-from coordinator.live_robot.messenger import Messenger, Record
+from coordinator.live_robot.messenger import Messenger, Record, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, SESSION
@@ -319,12 +319,12 @@ class LiveRobot:
         """Take the lease of modules (all by default) and renew it until the connection ends.
 
         Raises:
-            Refused: another program holds one; the message names it and the time left.
+            Refused: another program holds one; the message names it and the time left. The others are held.
         """
-        for serial in serials or self.serials:
-            await self.group.acquire(serial)
+        # The keep-alives first: a lease must not expire while the next module is slow to answer.
         if self._keeper is None:
             self._keeper = asyncio.create_task(self.group.keep_alive())
+        await gather_all(self.group.acquire(serial) for serial in serials or self.serials)
 
     async def move_to(self, position_rad: Mapping[str, float], max_speed_rad_s: float = 0.5) -> None:
         """Move joints of held modules to positions, all at the same time, by minimum jerk.

@@ -104,15 +104,15 @@ class LiveStates:
 
     async def _hold(self) -> None:
         group = self._group = ModuleGroup(self._messenger, self._states.recording, self._clock, self._sender)
+        # The keep-alives first: a lease must not expire while the next module is slow to answer.
+        self._keeper = asyncio.create_task(group.keep_alive())
+        self._keeper.add_done_callback(self._kept)
         try:
             await group.meet(sorted(self._messenger.alive))
-            for serial in group.serials:
-                await group.acquire(serial)
+            await gather_all(group.acquire(serial) for serial in group.serials)
         except RobotError:
             await self._release()
             raise
-        self._keeper = asyncio.create_task(group.keep_alive())
-        self._keeper.add_done_callback(self._kept)
         self._note(f"held: {', '.join(group.serials)}")
 
     async def _light_next(self) -> None:

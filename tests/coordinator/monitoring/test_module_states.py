@@ -23,6 +23,7 @@ from coordinator.monitoring.live_states import LiveStates
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from coordinator.runtime.key_presses import key_presses
 from coordinator.synchronisation.feedback_delays import FeedbackDelay
+from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.wire.keys import Leaf
 
 # Module clock behind the session's: 40 days of uptime.
@@ -192,6 +193,16 @@ def test_a_key_holds_all_modules_and_the_same_key_releases_them(follower: Follow
     assert follower.notes == ["held: X-00009, X-00010", "released"]
 
 
+def test_a_key_holds_modules_that_take_longer_to_take_than_a_lease_lasts(rigs: Callable[..., Any]) -> None:
+    """Four answers of 80 ms each, one after the other, would be longer than the 250 ms of a lease."""
+    follower = Follower(rigs("a2085_04", NetworkProfile(name="far", delay_ms=40.0)))
+    held: list[str] = []
+    follower.rig.at(1.0, follower.live.hold)
+    follower.rig.at(3.0, lambda: held.extend(follower.rig.state(s) for s in follower.rig.serials))
+    follower.follow(3.5)
+    assert held == ["armed"] * 4
+
+
 def test_a_key_stops_all_modules_also_those_that_another_program_holds(follower: Follower) -> None:
     _, _, group = follower.rig.group("another")
 
@@ -208,7 +219,7 @@ def test_a_key_stops_all_modules_also_those_that_another_program_holds(follower:
     assert follower.notes == ["stopped: X-00009, X-00010"]
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.0005, 0.001, 0.002, 0.004])
+@pytest.mark.parametrize("after_s", [0.0, 0.0005, 0.001, 0.0015, 0.002])
 def test_a_stop_while_the_leases_are_being_taken_stops_all_modules_for_good(
     follower: Follower, after_s: float
 ) -> None:
