@@ -36,6 +36,10 @@ from module_agent.wire.refusal import Refusal
 POLL_S = 0.02
 # Four keep-alives within the default lifetime of 250 ms.
 KEEP_ALIVE_S = 0.06
+# So many modules are asked to answer each keep-alive: a lost lease shows at once, and the answer is a round
+# trip for the module's clock. Question and answer cost five times what a publication does, so that of more
+# modules these are asked in turn, and all others are told.
+ANSWERED = 8
 # A renewal that takes longer, or is lost, marks the network as poor for a while.
 LATE_NS = 100_000_000
 POOR_NS = 10_000_000_000
@@ -90,6 +94,7 @@ class ModuleGroup:
         self._rows: dict[str, RowCompletion] = {}
         self._last_id = 0
         self._renewals: set[asyncio.Task[None]] = set()
+        self._turn = 0
         self._taken_by: dict[str, str] = {}
         self._running: dict[str, _Started] = {}
         self._streams: set[str] = set()
@@ -278,15 +283,23 @@ class ModuleGroup:
             self.renew()
             await asyncio.sleep(0.5 * KEEP_ALIVE_S)
             if self.is_poor:
-                for serial in list(self._tokens):
-                    again = self._repeat if serial in self._running else self._renew
-                    self._send(again(serial))
+                self._renew_by(self._repeat_or_renew)
             await asyncio.sleep(0.5 * KEEP_ALIVE_S)
 
     def renew(self) -> None:
         """Renew all leases once; needed every `KEEP_ALIVE_S` without `keep_alive`."""
-        for serial in list(self._tokens):
-            self._send(self._renew(serial))
+        self._renew_by(self._renew)
+
+    def _renew_by(self, ask: Callable[[str], Coroutine[None, None, None]]) -> None:
+        """Renew all leases: of `ANSWERED` modules in turn by what `ask` returns, of others unanswered."""
+        held = list(self._tokens)
+        begin = self._turn % max(1, len(held))
+        in_turn = held[begin:] + held[:begin]
+        self._turn = begin + min(ANSWERED, len(held))
+        for serial in in_turn[:ANSWERED]:
+            self._send(ask(serial))
+        for serial in in_turn[ANSWERED:]:
+            self._messenger.publish(serial, Leaf.LEASE, self._lease(serial, "renew"), self._secret)
 
     def _send(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.create_task(work)
@@ -304,6 +317,9 @@ class ModuleGroup:
                 self._taken_by[serial] = refused.ack.detail
         if self._clock() - sent_ns > LATE_NS:
             self._poor_until_ns = self._clock() + POOR_NS
+
+    def _repeat_or_renew(self, serial: str) -> Coroutine[None, None, None]:
+        return (self._repeat if serial in self._running else self._renew)(serial)
 
     async def _repeat(self, serial: str) -> None:
         """Command a module's latest motion again; a module begins no motion twice."""

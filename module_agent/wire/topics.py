@@ -82,7 +82,12 @@ TOPICS: dict[Leaf, Topic] = {
         reply=Feedback,
         max_bytes_from_module=MAX_MESSAGE_BYTES,
     ),
-    Leaf.LEASE: Topic("Acquire, renew or release the command of the joint.", request=LeaseRequest),
+    Leaf.LEASE: Topic(
+        "Acquire, renew or release the command of the joint; what is published is not answered.",
+        publication=LeaseRequest,
+        published_by="coordinator",
+        request=LeaseRequest,
+    ),
     Leaf.MOTION: Topic(
         "Start a motion that runs on the module; the module announces it to the others by its status.",
         publication=Status,

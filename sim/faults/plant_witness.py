@@ -102,8 +102,8 @@ class PlantWitness:
         if kind != "reply":
             if endpoint in self._commanders and parts.leaf in COMMANDS:
                 self._sent_ns[parts.serial] = now_ns
-                if parts.leaf is Leaf.SETPOINT:
-                    # Nothing answers it: one that is refused counts, too.
+                if kind == "sample":
+                    # Nothing answers what is published: a command that is refused counts, too.
                     self._accepted_ns[parts.serial] = now_ns
             if parts.leaf is Leaf.LEASE:
                 self._asked(parts.serial, endpoint, payload)

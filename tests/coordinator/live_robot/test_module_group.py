@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted
-from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused
-from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused, gather_all
+from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
 from module_agent.control.motion import effort_profile
 from module_agent.network_emulation.profile import NetworkProfile
-from module_agent.wire.keys import Leaf
+from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest, Setpoint
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
+# Sixteen modules.
+MANY = "snake16"
 # With 30 ms a way in the mean and long tails, the default of 250 ms expires every few seconds.
 PATIENT_NS = 500_000_000
 SLOW = GoTo(target_rad=1.0, max_speed_rad_s=0.6)
@@ -184,6 +186,57 @@ def test_a_holder_whose_lease_is_taken_notices(rigs: Callable[..., Any]) -> None
         keeper = asyncio.create_task(first.keep_alive())
         with pytest.raises(ModuleLost, match=f"module {BASE} is lost: its lease was taken: held by second"):
             await first.wait(lambda: False, 1.0)
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_of_many_modules_eight_in_turn_answer_a_keep_alive_and_all_stay_held(
+    rigs: Callable[..., Any],
+) -> None:
+    said: dict[tuple[str, str], int] = {}
+
+    def tap(_now_ns: int, endpoint: str, kind: str, at: str, _payload: bytes) -> None:
+        if endpoint == "tester" and parse(at).leaf is Leaf.LEASE:
+            said[parse(at).serial, kind] = said.get((parse(at).serial, kind), 0) + 1
+
+    rig = rigs(MANY, "lossy", tap=tap)
+    _, _, group = rig.group()
+
+    async def work() -> None:
+        keeper = asyncio.create_task(group.keep_alive())
+        await _met(group, *rig.serials)
+        await gather_all(group.acquire(serial) for serial in rig.serials)
+        await asyncio.sleep(0.5)
+        said.clear()
+        await group.wait(lambda: False, 50 * KEEP_ALIVE_S)
+        assert {rig.state(serial) for serial in rig.serials} == {"armed"}
+        keeper.cancel()
+
+    rig.run(work())
+    # Half of sixteen are asked each time; a lossy network is poor, so that all are renewed twice as often.
+    for kind in ("request", "sample"):
+        each = [said[serial, kind] for serial in rig.serials]
+        assert max(each) - min(each) <= 1
+        assert 24 <= min(each) <= 51
+
+
+def test_of_many_modules_too_a_lease_that_is_taken_is_noticed(rigs: Callable[..., Any]) -> None:
+    """At the latest when the module's turn to answer comes."""
+    rig = rigs(MANY)
+    _, _, first = rig.group("first")
+    _, _, second = rig.group("second")
+
+    async def work() -> None:
+        for group in (first, second):
+            await _met(group, *rig.serials)
+        await gather_all(first.acquire(serial) for serial in rig.serials)
+        await asyncio.sleep(1.1)
+        taken = rig.serials[-1]
+        await second.acquire(taken)
+        keeper = asyncio.create_task(first.keep_alive())
+        with pytest.raises(ModuleLost, match=f"module {taken} is lost: its lease was taken: held by second"):
+            await first.wait(lambda: False, 2 * KEEP_ALIVE_S + POLL_S)
         keeper.cancel()
 
     rig.run(work())

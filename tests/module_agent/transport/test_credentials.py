@@ -143,34 +143,45 @@ def test_what_a_hostile_module_or_observer_does_in_the_name_of_another_fails_onl
     net.hub.watch_alive(every(ROBOT, Leaf.ALIVE), heard.append)
     b = net.join("B")
     aims: list[Event] = []
-    b.subscribe(key(ROBOT, "B", Leaf.SETPOINT), aims.append)
+    commands = Leaf.SETPOINT, Leaf.LEASE
+    for leaf in commands:
+        b.subscribe(key(ROBOT, "B", leaf), aims.append)
     leases = serve(b, "B", Leaf.LEASE, b"of B")
     wait(lambda: asked(net.hub, key(ROBOT, "B", Leaf.LEASE)).payload == b"of B")
     leases.clear()
     for intruder in (net.join("A"), net.join(OBSERVER)):
         overheard: list[Event] = []
-        intruder.subscribe(key(ROBOT, "B", Leaf.SETPOINT), overheard.append)
+        for leaf in commands:
+            intruder.subscribe(key(ROBOT, "B", leaf), overheard.append)
         intruder.declare_alive(key(ROBOT, "GHOST", Leaf.ALIVE))
         stolen = serve(intruder, "B", Leaf.GAINS, b"of the intruder")
         time.sleep(GRACE_S)
         heard.clear(), aims.clear(), leases.clear()
         intruder.publish(key(ROBOT, "B", Leaf.FEEDBACK), b"forged")
-        intruder.publish(key(ROBOT, "B", Leaf.SETPOINT), b"forged")
+        for leaf in commands:
+            intruder.publish(key(ROBOT, "B", leaf), b"forged")
         lease = asked(intruder, key(ROBOT, "B", Leaf.LEASE))
         gains = asked(net.hub, key(ROBOT, "B", Leaf.GAINS))
-        net.hub.publish(key(ROBOT, "B", Leaf.SETPOINT), b"true")
-        wait(lambda: Sample(key(ROBOT, "B", Leaf.SETPOINT), b"true") in aims)
+        for leaf in commands:
+            net.hub.publish(key(ROBOT, "B", leaf), b"true")
+        wait(lambda: set(samples(b"true", *commands)) <= set(aims))
         time.sleep(GRACE_S)
         succeeded = {
             "forged rows": Sample(key(ROBOT, "B", Leaf.FEEDBACK), b"forged") in heard,
-            "forged setpoints": Sample(key(ROBOT, "B", Leaf.SETPOINT), b"forged") in aims,
-            "overheard setpoints": Sample(key(ROBOT, "B", Leaf.SETPOINT), b"true") in overheard,
+            "forged setpoints": samples(b"forged", Leaf.SETPOINT)[0] in aims,
+            "forged renewals": samples(b"forged", Leaf.LEASE)[0] in aims,
+            "overheard setpoints": samples(b"true", Leaf.SETPOINT)[0] in overheard,
+            "overheard renewals": samples(b"true", Leaf.LEASE)[0] in overheard,
             "asked for the lease": bool(leases) or lease.payload is not None,
             "answered for another": bool(stolen) or gains.payload is not None,
         }
         assert succeeded == dict.fromkeys(succeeded, not is_secured)
     ghosts = [event for event in net_tokens(net) if event.key == key(ROBOT, "GHOST", Leaf.ALIVE)]
     assert bool(ghosts) == (not is_secured)
+
+
+def samples(payload: bytes, *leaves: Leaf) -> list[Sample]:
+    return [Sample(key(ROBOT, "B", leaf), payload) for leaf in leaves]
 
 
 def net_tokens(net: Network) -> list[Liveness]:
