@@ -31,6 +31,11 @@ class ExcludedModules:
         """Return the modules that take part."""
         return tuple(s for s in self._group.serials if s not in self.why)
 
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The modules that are absent or at fault, without which the robot is not known whole."""
+        return tuple(s for s in sorted(self.why) if s not in self._well)
+
     async def meet(self, serials: Sequence[str]) -> None:
         """Register more modules; exclude those that are present but do not answer or send no feedback."""
         met = list(self._group.serials)

@@ -195,8 +195,14 @@ class Session:
         await self._settle_doubts()
         self._report("topology and chain")
         await self._reporter.explored()
-        if self._plan.dynamics:
+        if self._plan.dynamics and not self._excluded.missing:
             await self._show_inertia()
+        elif self._plan.dynamics:
+            self._total -= self._excitations(len(self.group.serials))
+            if self._times is not None:
+                self._times.excite((), ())
+            gone = ", ".join(self._excluded.missing)
+            self._reporter.note(f"no motions for the inertia: the robot is not known whole without {gone}")
 
     # ------------------------------------------------------------------ modules that join the robot
 

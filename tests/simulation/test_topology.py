@@ -204,6 +204,16 @@ def test_all_joints_are_excited_together_only_if_all_take_part(arm: Any, narrow:
     assert excited == set(arm.serials) - ({"elbow"} if narrow else set())
 
 
+def test_no_joint_is_excited_where_a_module_is_missing(arm: Any) -> None:
+    """Without it no inertia is identified."""
+    arm.run(asyncio.sleep(0.2))
+    arm.freeze("wrist")
+    recording, watcher = explore(arm, PLAN.model_copy(update={"dynamics": True, "dynamic_repeats": 1}))
+    assert {e.purpose for e in recording.journal if e.what == "motion"}.isdisjoint({"dynamic", "held_out"})
+    assert "no motions for the inertia: the robot is not known whole without wrist" in watcher.notes
+    assert recording.journal[-1].step == "back"
+
+
 def test_a_joint_whose_limits_forbid_the_motion_is_named_and_all_else_is_explored(arm: Any) -> None:
     narrow_elbow(arm)
     recording, watcher = explore(arm)
