@@ -7,6 +7,11 @@ What the modules send is checked as every sample is.
 A module is sent nothing until it is first to follow a target, which only the acquisition of its lease makes
 it. So it is again after it has switched its motor off by itself, at its M-stop or at a limit: HEBI's modules
 then keep strategy 0 until they are given another, which must be no side effect of the end of a lease.
+
+Gains are written whenever a module begins to follow: another program may have had it meanwhile. A brake is a
+velocity of 0 under the factory's gains, since those of a holder may drive the motor. Before the driver falls
+silent it writes the gains that the modules came with, so that neither other programs nor the next agent take
+those of a holder for the owner's; an agent that is killed cannot do so.
 """
 
 import math
@@ -17,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V, Command
-from module_agent.control.gains import from_message
+from module_agent.control.gains import default_gains, from_message
 from module_agent.hardware.hardware import (
     HardwareLost,
     LimitState,
@@ -26,6 +31,7 @@ from module_agent.hardware.hardware import (
     SensorSample,
 )
 from module_agent.hardware.hebi_library import Group, Library, told_states
+from module_agent.hardware.loop_inside import DEFAULT_STRATEGY
 from module_agent.hardware.sample_check import MAX_HELD, SampleCheck
 from module_agent.model.catalogue import module_type
 from module_agent.wire.messages import GainSet
@@ -95,6 +101,7 @@ class HebiModules:
         self._information = list(information)
         self._wait, self._stamp = wait, stamp
         self._links = [_Link(one) for one in information]
+        self._own_gains = [one.gains for one in information]
         count = len(self._links)
         self._feedback = library.GroupFeedback(count)
         self._command = library.GroupCommand(count)
@@ -105,7 +112,6 @@ class HebiModules:
         self._ticks = self._missed = self._unsent = 0
         # Since when all motors are off; before the first command there is nothing to repeat.
         self._off_ticks: float = math.inf
-        self._new_gains: set[int] = set()
         self._closed = False
         group.feedback_frequency = 0.0
         self._apply_lifetime()
@@ -157,24 +163,25 @@ class HebiModules:
                 f"{len(commands)} commands for {len(self._links)} modules, {self._ticks} ticks have been "
                 "read: receive a sample first, then send one command per module"
             )
-        for index, command in enumerate(commands):
-            self._take(index, command)
+        heard = self._may_follow
+        due = [index for index, command in enumerate(commands) if self._take(index, command)]
         active = bool(np.isfinite(self._targets).any())
         self._off_ticks = 0 if active else self._off_ticks + 1
-        if any(not self._links[index].is_withheld for index in self._new_gains):
-            self._send_gains()
+        if due:
+            self._send_gains(due)
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
         if active or self._may_follow:
             self._send_targets()
+        elif heard and self._lent:
+            self._hand_back()
         return [link.pwm for link in self._links]
 
     def set_gains(self, index: int, gains: GainSet) -> None:
-        """Replace the gains of a module until its next power cycle, with the next command that is sent.
+        """Replace the gains of a module while it is commanded, with the next command that is sent.
 
         HEBI's messages have gains and targets together: sent now they would repeat targets that have expired.
         A module that is sent nothing gets them with its first target.
         """
-        self._new_gains.add(index)
         self._information[index] = self._information[index]._replace(gains=gains)
 
     def set_lifetime(self, index: int, lifetime_ns: int) -> None:
@@ -195,16 +202,13 @@ class HebiModules:
         self._group.send_command(command)
 
     def close(self) -> None:
-        """Send a last command without targets to modules that may follow one. May be called twice."""
+        """Send a last command, without targets, to modules that may follow one. May be called twice."""
         if self._closed:
             return
         self._closed = True
-        if not self._may_follow:
-            return
-        self._targets[:] = math.nan
-        for _ in range(_CONFIRM_TRIES):
-            if self._group.send_command_with_acknowledgement(self._settings(), timeout_ms=_CONFIRM_MS):
-                return
+        if self._may_follow:
+            self._targets[:] = math.nan
+            self._hand_back()
 
     @property
     def _names(self) -> str:
@@ -252,27 +256,48 @@ class HebiModules:
         # Only a 0 may stand for what is not there.
         return states if states.all() else np.where(self._told(answer, name), states, unset)
 
-    def _take(self, index: int, command: Command) -> None:
-        """Keep the target of a module, or none while it is sent nothing.
+    def _take(self, index: int, command: Command) -> bool:
+        """Keep the target of a module, or none while it is sent nothing; return whether its gains are due.
 
         A target that is no brake comes from a lease that was acquired since the module switched itself off:
         until then the firmware lets it rest, or brakes. The module gets its strategy back with its gains.
         """
-        link = self._links[index]
-        follows = not command.brake and any(map(math.isfinite, command[:3]))
-        if link.is_withheld and follows and not link.stays_off:
+        link, follows = self._links[index], any(map(math.isfinite, command[:3]))
+        if follows and not (command.brake or link.stays_off):
             link.is_withheld = False
-            self._new_gains.add(index)
+        begins, link.follows = follows and not link.follows, follows and not link.is_withheld
         self._targets[index] = math.nan if link.is_withheld else command[:3]
+        if begins or link.is_withheld or not self._may_follow:
+            link.given = None
+        if not link.follows and link.given is None:
+            return False
+        link.wanted = link.brake_gains if command.brake else self._information[index].gains
+        return link.wanted is not link.given
 
-    def _send_gains(self) -> None:
+    def _send_gains(self, indices: Sequence[int]) -> None:
+        command, links = self._settings(), [self._links[index] for index in indices]
+        for index, link in zip(indices, links, strict=True):
+            write_gains(command[index], link.wanted)
+        self._confirmed(command, f"the gains of {', '.join(link.serial for link in links)}")
+        for link in links:
+            link.given = link.wanted
+
+    @property
+    def _lent(self) -> list[int]:
+        """The modules that have other gains than those that they came with, by this driver."""
+        given = enumerate(zip(self._links, self._own_gains, strict=True))
+        return [index for index, (link, own) in given if link.given is not None and link.given is not own]
+
+    def _hand_back(self) -> None:
+        """Give the modules the gains that they came with, as far as they confirm it; none has a target."""
         command = self._settings()
-        given = sorted(index for index in self._new_gains if not self._links[index].is_withheld)
-        for index in given:
-            write_gains(command[index], self._information[index].gains)
-        names = ", ".join(self._links[index].serial for index in given)
-        self._confirmed(command, f"the gains of {names}")
-        self._new_gains.difference_update(given)
+        for index in self._lent:
+            write_gains(command[index], self._own_gains[index])
+        for link in self._links:
+            link.given = None
+        for _ in range(_CONFIRM_TRIES):
+            if self._group.send_command_with_acknowledgement(command, timeout_ms=_CONFIRM_MS):
+                return
 
     def _send_targets(self) -> None:
         self._write_targets(self._command)
@@ -309,6 +334,8 @@ class _Link:
 
     stays_off: it holds its motor off by itself, at its M-stop or at a limit. is_withheld: it is sent neither
     targets nor gains until it is to follow a target. m_stop_latches: the M-stop leaves its motor off.
+    follows: its last target was one. given: the gains that were written last, None where another program may
+    have written others since; wanted: those that are to be.
     """
 
     def __init__(self, information: ModuleInformation):
@@ -320,6 +347,10 @@ class _Link:
         self.m_stop_latches = information.safety.m_stop not in ("hold", "disabled")
         self.stays_off = False
         self.is_withheld = True
+        self.follows = False
+        self.given: GainSet | None = None
+        self.wanted = information.gains
+        self.brake_gains = default_gains(module_type(information.module_type), DEFAULT_STRATEGY)
         self._check = SampleCheck(module_type(information.module_type))
         self._sequence = 0
         self._misses = 0

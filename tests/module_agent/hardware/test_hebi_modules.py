@@ -289,6 +289,54 @@ def test_a_motor_stays_off_after_its_m_stop_until_the_lease_is_acquired_with_the
     assert leased.module.gains.strategy == (4 if presses == "under a lease" else 3)
 
 
+def test_a_stop_brakes_under_the_factorys_gains_whatever_the_holders_gains_do(leased: Leased) -> None:
+    """Gains of a velocity loop whose least output drives the motor pass every check of gains."""
+    own = default_gains(leased.module._kind, 3)
+    driving = own.model_copy(update={"velocity": own.velocity.model_copy(update={"min_output": 0.3})})
+    assert leased.acquire().accepted
+    assert leased.ask(Leaf.GAINS, GainsCommand, gains=driving, keep=True).accepted
+    leased.run(20)
+    assert leased.pwm[LAST] > 0.1
+    assert leased.ask(Leaf.STOP, Stop, why="for the test").accepted
+    leased.run(50)
+    assert leased.module.gains.velocity.min_output == -1.0
+    assert abs(leased.sample.sensors.velocity_rad_s) < 0.01
+    assert leased.acquire().accepted
+    leased.run(2)
+    assert leased.module.gains.velocity.min_output == pytest.approx(0.3)
+
+
+def test_the_next_agent_and_other_programs_find_the_gains_that_the_module_came_with(leased: Leased) -> None:
+    own = default_gains(leased.module._kind, 4)
+    leased.module._loops.set_gains(0, own)
+    for ends in ("the agent", "the lease", "its holder"):
+        leased.boot()
+        assert leased.acquire().accepted
+        assert leased.give_gains(2).accepted
+        assert leased.module.gains.strategy == 2
+        if ends == "the lease":
+            assert leased.ask(Leaf.LEASE, LeaseRequest, action="release", duration_ns=1).accepted
+        if ends != "the agent":
+            leased.run(2 * 250 // TICKS)
+        leased.driver.close()
+        assert hebi_network.describe(leased.library, leased.group, 250.0)[LAST].gains == own
+
+
+def test_every_lease_has_its_gains_also_after_another_program_had_the_module(leased: Leased) -> None:
+    others = default_gains(leased.module._kind, 2)
+    assert leased.acquire().accepted
+    leased.run(5)
+    # Its holder dies: the motor is off, and a lifetime later nothing is sent any more.
+    leased.run(2 * 250 // TICKS)
+    leased.module._loops.set_gains(0, others)
+    leased.run(400)
+    assert leased.firmware.lease.holder is None
+    assert leased.module.gains == others
+    assert leased.acquire().accepted
+    leased.run(2)
+    assert leased.module.gains.strategy == leased.firmware._info().gains.strategy == 3
+
+
 def test_nothing_is_sent_to_a_module_before_its_first_lease_and_its_owners_gains_stay(
     leased: Leased, monkeypatch: pytest.MonkeyPatch
 ) -> None:
