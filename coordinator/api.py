@@ -342,8 +342,10 @@ class LiveRobot:
             self._keeper.cancel()
             with suppress(asyncio.CancelledError):
                 await self._keeper
+        try:
             await self.group.release_all()
-        self._messenger.close()
+        finally:
+            self._messenger.close()
 
 
 @asynccontextmanager

@@ -21,7 +21,7 @@ from module_agent.transport.transport import (
 )
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, encode
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Message, Stop
+from module_agent.wire.messages import Ack, Message, Stop, cut
 from module_agent.wire.proof import proven
 from module_agent.wire.refusal import WireError
 from module_agent.wire.topics import HEARD_BY_COORDINATOR
@@ -209,7 +209,7 @@ class Messenger:
             Refused, NoAnswer: see `command`.
         """
         for left in reversed(range(STOP_ATTEMPTS)):
-            stop = Stop(serial=serial, boot=0, seq=self.next_seq(), sender=sender, why=why)
+            stop = Stop(serial=serial, boot=0, seq=self.next_seq(), sender=sender, why=cut(why))
             try:
                 await self.command(serial, Leaf.STOP, stop, STOP_ANSWER_S)
                 return

@@ -268,6 +268,7 @@ class ModuleGroup:
             Refused: another sender holds it; the message names the holder and the time left.
         """
         self._running.pop(serial, None)
+        self._taken_by.pop(serial, None)
         ack = await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "acquire"))
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
         # Its lifetime counts from the echo in the request: on a slow network little of it is left.
@@ -276,8 +277,9 @@ class ModuleGroup:
     async def keep_alive(self) -> None:
         """Renew all leases until cancelled; a late answer does not hold up the next renewal.
 
-        While renewals are late or lost, the running motions are commanded again in between, which renews the
-        lease too: messages keep their order on one key, and are seldom late on two keys at the same time.
+        While renewals are late or lost, running motions of the modules that were asked are commanded again in
+        between, which renews the lease too: messages keep their order on one key, and are seldom late on two
+        keys at the same time.
         """
         while True:
             self.renew()
@@ -288,14 +290,14 @@ class ModuleGroup:
 
     def renew(self) -> None:
         """Renew all leases once; needed every `KEEP_ALIVE_S` without `keep_alive`."""
+        self._turn += ANSWERED
         self._renew_by(self._renew)
 
     def _renew_by(self, ask: Callable[[str], Coroutine[None, None, None]]) -> None:
-        """Renew all leases: of `ANSWERED` modules in turn by what `ask` returns, of others unanswered."""
+        """Renew all leases: of the `ANSWERED` modules whose turn it is by what `ask` returns."""
         held = list(self._tokens)
-        begin = self._turn % max(1, len(held))
+        begin = self._turn % len(held) if len(held) > ANSWERED else 0
         in_turn = held[begin:] + held[:begin]
-        self._turn = begin + min(ANSWERED, len(held))
         for serial in in_turn[:ANSWERED]:
             self._send(ask(serial))
         for serial in in_turn[ANSWERED:]:
@@ -332,7 +334,7 @@ class ModuleGroup:
 
     async def release_all(self) -> None:
         """Release all modules; their motors are off then."""
-        await asyncio.gather(*(self._release(serial) for serial in list(self._tokens)))
+        await gather_all(self._release(serial) for serial in list(self._tokens))
 
     async def _release(self, serial: str) -> None:
         try:
@@ -397,9 +399,10 @@ class ModuleGroup:
                 f"efforts for {idle[0]}, which has no motion; of those that have one: {', '.join(patterns)}"
             )
         started = {s: _Started(self._next_id(), pattern, fed.get(s)) for s, pattern in patterns.items()}
+        stood_rad = {serial: self.position_rad(serial) or 0.0 for serial in patterns}
         await gather_all(self._start(serial, motion) for serial, motion in started.items())
         # Where the last other joint has been excluded, nothing is left to move.
-        durations_s = [duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items()]
+        durations_s = [duration_s(pattern, stood_rad[serial]) for serial, pattern in patterns.items()]
         longest = max(durations_s, default=0.0)
         ended = await self.wait(
             lambda: (
@@ -439,10 +442,6 @@ class ModuleGroup:
             if serial not in moved and status is not None and status.state == "expired":
                 return serial
         return None
-
-    def _origin(self, serial: str) -> float:
-        status = self.module(serial).status
-        return status.motion.origin_rad if status is not None and status.motion is not None else 0.0
 
     def _ended(self, serial: str, number: int) -> bool:
         status = self.status_under_lease(serial)

@@ -66,17 +66,21 @@ class LiveStates:
 
     def stop(self) -> None:
         """Stop every module at once; what is held, or is being taken, is released."""
-        # An acquisition that came after the stop would arm its module again.
-        if self._holding is not None:
-            self._holding.cancel()
+        self._cancel_holding()
         self._do(self._stop())
 
     def hold(self) -> None:
         """Take the leases, so that every module holds its position; the second time, release them."""
         if self.holds:
+            self._cancel_holding()
             self._do(self._release())
         else:
             self._holding = self._do(self._hold())
+
+    def _cancel_holding(self) -> None:
+        """End an acquisition that is under way: later than a stop it would arm its module again."""
+        if self._holding is not None:
+            self._holding.cancel()
 
     def light(self) -> None:
         """Light the LED of the next module by serial, so that it is found; after the last one none is lit."""

@@ -14,7 +14,7 @@ from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import UNCALIBRATED, ImuPrior
 from module_agent.peers.motion_listener import JointMotion
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import CircleEstimate, MotionRecord, RegressionEstimate, Vector3
+from module_agent.wire.messages import CircleEstimate, MotionRecord, RegressionEstimate, Vector3, cut
 
 # Own samples to either side of a motion: more than the rough clock mapping may be wrong by.
 MARGIN_NS = 150_000_000
@@ -106,7 +106,7 @@ class Observer:
             # Published as a finding: it explains why there is no estimate. The rows of others may be anything
             # such as times that no spline takes, and must not end this process. LinAlgErrors are ValueErrors.
             why = str(error) if found.circle is None else f"no joint regression: {error}"
-            found = found._replace(note=why[:512])
+            found = found._replace(note=cut(why))
         return found
 
 

@@ -10,6 +10,8 @@ from module_agent.wire.messages import ExpiryAction, Limits
 
 # What a message carries.
 MAX_NAME = 64
+# Half a lifetime without a tick counts as a clock that jumped.
+MIN_LIFETIME_TICKS = 4
 
 
 class FirmwareConfig(NamedTuple):
@@ -47,6 +49,8 @@ class FirmwareConfig(NamedTuple):
 def config_of(module: ModuleInformation, boot: int, **settings: Any) -> FirmwareConfig:
     """Return the settings of a module as it describes itself; others as given.
 
+    A row of feedback is measured in a tick, so that there are no more of them than ticks.
+
     Raises:
         UnknownModuleType: the catalogue has no such type.
     """
@@ -56,18 +60,24 @@ def config_of(module: ModuleInformation, boot: int, **settings: Any) -> Firmware
         "family": module.family[:MAX_NAME],
         "safety": module.safety,
     }
-    return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **own | settings)
+    config = FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **own | settings)
+    return config._replace(feedback_rate_hz=min(config.feedback_rate_hz, 1e9 / config.tick_ns))
 
 
 def check_config(config: FirmwareConfig) -> FirmwareConfig:
     """Return the configuration if it can be run.
 
     Raises:
-        UsageError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot
+        UsageError: a lifetime that is infinite, over 1 s or of too few ticks, or a rate that a message cannot
         carry.
     """
     if not 0 < config.lifetime_ns <= 1_000_000_000:
-        raise UsageError(f"lifetime {config.lifetime_ns / 1e6:.0f} ms: it must be over 0 and at most 1000 ms")
+        raise UsageError(f"lifetime {config.lifetime_ns / 1e6:g} ms: it must be over 0 and at most 1000 ms")
+    if config.lifetime_ns < MIN_LIFETIME_TICKS * config.tick_ns:
+        raise UsageError(
+            f"lifetime {config.lifetime_ns / 1e6:g} ms: it must be at least {MIN_LIFETIME_TICKS} ticks of "
+            f"{config.tick_ns / 1e6:g} ms"
+        )
     if not 1.0 <= config.feedback_rate_hz <= 1000.0:
         raise UsageError(f"feedback rate {config.feedback_rate_hz} Hz: it must be 1 to 1000 Hz")
     if not 1 <= config.batch_rows <= 64:

@@ -39,6 +39,7 @@ from module_agent.wire.messages import (
     State,
     Status,
     Stop,
+    cut,
 )
 from module_agent.wire.refusal import Refusal, WireError
 
@@ -282,9 +283,11 @@ class Firmware:
             raise WireError(
                 Refusal.NOT_ARMED, f"{trigger} is not possible while {self.state}{why}: acquire first"
             )
+        # What led to a state stays its reason: a release, or a stop of a module in fault, tells less.
+        if target != self.state or not (trigger == "release" or target == "fault"):
+            self._note = note
         self.state = target
         self._status_due_ns = 0
-        self._note = note
 
     def _apply_gains(self, gains: GainSet) -> None:
         self._gains = gains
@@ -507,7 +510,7 @@ class Firmware:
             expiries=self._expiries,
             dropped_events=self.dropped_events,
             limits=limits,
-            note=self._note[:512],
+            note=cut(self._note),
         )
 
     def _info(self) -> Info:
@@ -532,7 +535,7 @@ def acknowledgement(
     head: dict[str, Any], lease: Lease, now_ns: int, re: int, refused: WireError | None
 ) -> Ack:
     """Return the answer to command number `re`; `head` is what every message begins with."""
-    reason, detail = ("", "") if refused is None else (refused.reason.value, refused.detail[:512])
+    reason, detail = ("", "") if refused is None else (refused.reason.value, cut(refused.detail))
     accepted = refused is None
     return Ack(
         **head, **lease.state(now_ns), re=re, accepted=accepted, reason=reason, detail=detail, t_ns=now_ns

@@ -113,7 +113,9 @@ class MotionListener:
     def _is_outdated(self, status: Status) -> bool:
         """Return whether a later status or a later boot of this module has arrived."""
         newest = self._newest.get((status.serial, status.boot))
-        if newest is not None and (self._boot[status.serial] != status.boot or status.seq <= newest):
+        # A module that was forgotten has no latest boot, but its numbers are remembered.
+        latest = self._boot.get(status.serial, status.boot)
+        if newest is not None and (latest != status.boot or status.seq <= newest):
             return True
         # The latest last, so that what is forgotten was not heard of for the longest time.
         self._boot.pop(status.serial, None)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.firmware.feedback import History
-from module_agent.peers.motion_listener import AskHistory, Fetch
+from module_agent.peers.motion_listener import MAX_MODULES, AskHistory, Fetch
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.information_messages import CollectRequest, RowRange
 from module_agent.wire.messages import Feedback
@@ -80,7 +80,8 @@ class MotionCollection:
         dropped them. `now_ns` is any one steady clock of this process. A refused request changes nothing.
 
         Raises:
-            WireError: GONE for own rows that are not kept, WRONG_BOOT for those of another boot.
+            WireError: GONE for own rows that are not kept, WRONG_BOOT for those of another boot, LIMIT for a
+                motion of more modules or rows than are kept of all.
         """
         known = self._motions.get(request.motion_id, {})
         # All parts first, so that a refusal leaves no incomplete motion behind.
@@ -89,6 +90,13 @@ class MotionCollection:
             for wanted in request.rows
             if (kept := known.get(wanted.serial)) is None or kept.boot != wanted.boot or kept.lost
         }
+        whole = known | parts
+        if len(whole) > MAX_MODULES or _rows(whole) > MAX_ROWS:
+            raise WireError(
+                Refusal.LIMIT,
+                f"motion {request.motion_id} would have {_rows(whole)} rows of {len(whole)} modules: "
+                f"at most {MAX_ROWS} rows of {MAX_MODULES} modules are kept",
+            )
         for serial in parts.keys() & known.keys():
             known[serial].lost = True
         self._motions.setdefault(request.motion_id, {}).update(parts)

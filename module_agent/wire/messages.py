@@ -18,7 +18,9 @@ MAX_NAME = 64
 Name = Annotated[str, Field(max_length=MAX_NAME)]
 # One that stands for a module in a key: with any other no module could be asked.
 Serial = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,63}$")]
-Text = Annotated[str, Field(max_length=512)]
+# Of texts in bytes, which is what a reader bounds.
+MAX_TEXT_BYTES = 512
+Text = Annotated[str, Field(max_length=MAX_TEXT_BYTES)]
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Vector3 = tuple[Finite, Finite, Finite]
@@ -49,6 +51,11 @@ class Message(Part):
     serial: Name
     boot: Annotated[int, Field(ge=0, lt=2**64)]
     seq: Counter
+
+
+def cut(text: str) -> str:
+    """Return a text without what is too long for a message: characters may have several bytes."""
+    return text.encode(errors="replace")[:MAX_TEXT_BYTES].decode(errors="ignore")
 
 
 def out_of_range(detail: str) -> PydanticCustomError:

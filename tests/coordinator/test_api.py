@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from coordinator.api import LiveRobot, _recorder
-from coordinator.live_robot.messenger import Refused
+from coordinator.live_robot.messenger import NoAnswer, Refused
 from coordinator.recording.recording import Entry, Recording
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.wire.keys import Leaf, key
@@ -73,3 +73,20 @@ def test_where_another_program_holds_one_module_the_others_are_held(rigs: Callab
         return states
 
     assert rig.run(hold()) == ["armed"] * 4
+
+
+def test_the_network_is_left_though_an_agent_has_died(rigs: Callable[..., Any]) -> None:
+    rig = rigs("a2085_04", "lan")
+    messenger, recording, group = rig.group()
+
+    async def hold() -> None:
+        await group.meet(rig.serials)
+        arm = LiveRobot(messenger, group, recording)
+        await arm.hold()
+        rig.kill(rig.serials[0])
+        with pytest.raises(NoAnswer, match=f"module {rig.serials[0]} did not answer on lease"):
+            await arm.close()
+
+    rig.run(hold())
+    assert messenger._closed
+    assert [rig.state(serial) for serial in rig.serials[1:]] == ["idle"] * 3

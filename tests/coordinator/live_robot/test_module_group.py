@@ -221,6 +221,39 @@ def test_of_many_modules_eight_in_turn_answer_a_keep_alive_and_all_stay_held(
         assert 24 <= min(each) <= 51
 
 
+def test_on_a_poor_network_each_of_many_running_motions_is_commanded_again_and_its_lease_answered(
+    rigs: Callable[..., Any],
+) -> None:
+    said: dict[tuple[str, Leaf], int] = {}
+
+    def tap(_now_ns: int, endpoint: str, kind: str, at: str, _payload: bytes) -> None:
+        if (endpoint, kind) == ("tester", "request"):
+            said[parse(at).serial, parse(at).leaf] = said.get((parse(at).serial, parse(at).leaf), 0) + 1
+
+    rig = rigs(MANY, "lossy", tap=tap)
+    _, _, group = rig.group()
+
+    async def work() -> None:
+        keeper = asyncio.create_task(group.keep_alive())
+        await _met(group, *rig.serials)
+        await gather_all(group.acquire(serial) for serial in rig.serials)
+        await group.wait(lambda: group.is_poor, 5.0)
+        running = asyncio.create_task(group.run(dict.fromkeys(rig.serials, Rest(duration_s=3.0))))
+        await asyncio.sleep(0.5)
+        said.clear()
+        await asyncio.sleep(2.0)
+        assert group.is_poor
+        again = dict(said)
+        await running
+        keeper.cancel()
+        # In two seconds 33 keep-alives, of which every second asks.
+        for serial in rig.serials:
+            assert again[serial, Leaf.MOTION] >= 15
+            assert again[serial, Leaf.LEASE] >= 15
+
+    rig.run(work())
+
+
 def test_of_many_modules_too_a_lease_that_is_taken_is_noticed(rigs: Callable[..., Any]) -> None:
     """At the latest when the module's turn to answer comes."""
     rig = rigs(MANY)
@@ -237,6 +270,45 @@ def test_of_many_modules_too_a_lease_that_is_taken_is_noticed(rigs: Callable[...
         keeper = asyncio.create_task(first.keep_alive())
         with pytest.raises(ModuleLost, match=f"module {taken} is lost: its lease was taken: held by second"):
             await first.wait(lambda: False, 2 * KEEP_ALIVE_S + POLL_S)
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_a_module_whose_lease_was_taken_once_can_be_held_again(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, _, first = rig.group("first")
+    _, _, second = rig.group("second")
+
+    async def work() -> None:
+        keeper = await _armed(first, BASE)
+        await _met(second, BASE)
+        keeper.cancel()
+        await asyncio.sleep(1.1)
+        await second.acquire(BASE)
+        keeper = asyncio.create_task(first.keep_alive())
+        with pytest.raises(ModuleLost, match="its lease was taken"):
+            await first.wait(lambda: False, 1.0)
+        await second.release_all()
+        await first.acquire(BASE)
+        await first.run({BASE: Rest(duration_s=0.3)})
+        assert await first.stop_all("for the test") == []
+        assert rig.state(BASE) == "stopped"
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_a_motion_may_take_as_long_as_from_where_the_joint_stands(rigs: Callable[..., Any]) -> None:
+    """The status of the motion before it, which begins elsewhere, is the latest when it is acknowledged."""
+    rig = rigs(ARM, "lan")
+    _, _, group = rig.group()
+
+    async def work() -> None:
+        keeper = await _armed(group)
+        for target_rad, speed_rad_s in ((1.2, 1.5), (0.0, 1.5), (1.2, 0.3)):
+            there = await group.run({BASE: GoTo(target_rad=target_rad, max_speed_rad_s=speed_rad_s)})
+            assert there[BASE].outcome == "done"
         keeper.cancel()
 
     rig.run(work())

@@ -203,6 +203,18 @@ def test_a_key_holds_modules_that_take_longer_to_take_than_a_lease_lasts(rigs: C
     assert held == ["armed"] * 4
 
 
+@pytest.mark.parametrize("after_s", [0.0005, 0.001, 0.002])
+def test_a_release_while_the_leases_are_being_taken_releases_all_modules(
+    follower: Follower, after_s: float
+) -> None:
+    follower.rig.at(1.0, follower.live.hold)
+    follower.rig.at(1.0 + after_s, follower.live.hold)
+    follower.follow(3.0)
+    assert {follower.rig.state(serial) for serial in follower.rig.serials} <= {"idle", "expired"}
+    assert not follower.live.holds
+    assert not any(note.startswith("held") for note in follower.notes)
+
+
 def test_a_key_stops_all_modules_also_those_that_another_program_holds(follower: Follower) -> None:
     _, _, group = follower.rig.group("another")
 

@@ -13,11 +13,11 @@ from module_agent.control.gains import catalogue_limits, default_gains
 from module_agent.control.motion import effort_profile
 from module_agent.control.safety import Safety
 from module_agent.firmware.admission import Lease
-from module_agent.firmware.config import FirmwareConfig, check_config
+from module_agent.firmware.config import FirmwareConfig, check_config, config_of
 from module_agent.firmware.firmware import Firmware, Incoming, Publication, acknowledgement
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
 from module_agent.firmware.tick_kernel import BRAKE, FOLLOW, MOTION
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import ModuleInformation, SensorSample
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.errors import UsageError
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
@@ -662,12 +662,28 @@ def test_every_transition_leads_to_a_state_that_can_be_left_again() -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"lifetime_ns": 0}, {"lifetime_ns": 2_000 * MS}, {"feedback_rate_hz": 2000.0}, {"batch_rows": 0}],
+    [
+        {"lifetime_ns": 0},
+        {"lifetime_ns": 2_000 * MS},
+        {"lifetime_ns": 3 * MS},
+        {"feedback_rate_hz": 2000.0},
+        {"batch_rows": 0},
+    ],
 )
 def test_a_configuration_that_cannot_be_run_is_refused(settings: dict[str, Any]) -> None:
     kind = CATALOGUE["X5-1"]
     with pytest.raises(UsageError, match="must be"):
         check_config(FirmwareConfig("A", kind, 1, catalogue_limits(kind), **settings))
+
+
+def test_there_are_no_more_rows_than_ticks() -> None:
+    """A module that is read 100 times a second has 100 rows a second, and says so."""
+    kind = CATALOGUE["X5-1"]
+    slow = ModuleInformation(
+        "A", "", "", "X5-1", default_gains(kind, 3), catalogue_limits(kind), 10 * MS, 10 * MS
+    )
+    assert config_of(slow, 1, feedback_rate_hz=250.0).feedback_rate_hz == 100.0
+    assert config_of(slow, 1, feedback_rate_hz=50.0).feedback_rate_hz == 50.0
 
 
 # ------------------------------------------------------------------ sensors and clocks that fail

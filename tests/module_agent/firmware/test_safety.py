@@ -268,6 +268,39 @@ def test_a_fault_stays_the_reason_while_an_m_stop_is_pressed() -> None:
     assert "winding" in one.status().note
 
 
+@pytest.mark.parametrize("state", ["fault", "expired"])
+def test_what_led_to_a_state_stays_its_reason_when_its_lease_is_released(state: str) -> None:
+    one = Bench()
+    one.acquire()
+    if state == "fault":
+        one.winding_c = 155.0
+        one.tick()
+        assert one.ask(Leaf.STOP, Stop(**one.head(), why="module B is lost")).accepted
+    else:
+        one.ticks(260)
+    assert one.firmware.state == state
+    reason = one.status().note
+    assert reason in ("winding at 155 C", "no fresh command for 250 ms")
+    assert one.ask(Leaf.LEASE, LeaseRequest(**one.head(action="release"))).accepted
+    assert (one.firmware.state, one.status().note) == (state, reason)
+
+
+def test_a_second_stop_is_the_reason_of_a_stop() -> None:
+    one = Bench()
+    for why in ("first", "second"):
+        assert one.ask(Leaf.STOP, Stop(**one.head(), why=why)).accepted
+        assert one.status().note.endswith(why)
+
+
+@pytest.mark.parametrize("letter", ["a", "ä", "漢"])
+def test_a_long_text_in_any_script_leaves_the_status_readable(letter: str) -> None:
+    """A text is bounded by its bytes."""
+    one = Bench()
+    why = letter * (512 // len(letter.encode()))
+    assert one.ask(Leaf.STOP, Stop(**one.head(), why=why)).accepted
+    assert one.status().note.startswith(f"stopped by {one.head()['sender']}: {letter}")
+
+
 def test_release_needs_no_m_stop_to_be_released() -> None:
     one = bench(m_stop="hold")
     one.acquire()

@@ -368,6 +368,22 @@ def test_what_was_heard_of_modules_that_were_made_up_is_forgotten_with_them() ->
     assert len(listener._finished) == len(listener._boot) == MAX_MODULES
 
 
+def test_a_module_that_was_forgotten_is_heard_again_and_its_old_words_are_not() -> None:
+    listener = MotionListener()
+    for boot in (6, 7):
+        listener.on_status(_status(_record(1, 5, 5), seq=3, serial="M", boot=boot), 0, OWN)
+        listener.poll(0)
+    for number in range(MAX_MODULES):
+        listener.on_status(_status(None, serial=f"M{number}"), FORGET_NS + number, OWN)
+    assert "M" not in listener._boot
+    later = 3 * FORGET_NS
+    for boot in (6, 7):
+        listener.on_status(_status(_record(2, end=None), seq=3, serial="M", boot=boot), later, OWN)
+    assert "M" not in listener._tracks
+    listener.on_status(_status(_record(2, end=None), seq=4, serial="M", boot=7), later, OWN)
+    assert listener._tracks["M"].record.motion_id == 2
+
+
 def test_of_a_motion_without_an_end_no_more_rows_are_kept_than_of_any_other() -> None:
     listener = MotionListener()
     listener.on_status(_status(_record(start=1000, end=None, outcome="running")), 0, OWN)

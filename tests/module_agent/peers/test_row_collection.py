@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from module_agent.firmware.feedback import History
-from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, AskHistory
-from module_agent.peers.row_collection import GIVE_UP_NS, MAX_MOTIONS, MotionCollection, OwnRows
+from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, MAX_MODULES, AskHistory
+from module_agent.peers.row_collection import GIVE_UP_NS, MAX_MOTIONS, MAX_ROWS, MotionCollection, OwnRows
 from module_agent.wire.information_messages import CollectRequest, RowRange
 from module_agent.wire.messages import MAX_ROWS_PER_MOTION, Feedback
 from module_agent.wire.refusal import Refusal, WireError
@@ -159,6 +159,28 @@ def test_there_is_no_range_of_no_rows_or_of_more_than_are_kept(length: int) -> N
     with pytest.raises(ValidationError, match="1 to 100000 rows"):
         RowRange(serial=OWN, boot=7, first_row=10, end_row=10 + length)
     assert RowRange(serial=OWN, boot=7, first_row=10, end_row=10 + MAX_ROWS_PER_MOTION).first_row == 10
+
+
+def test_a_motion_of_more_modules_than_there_can_be_is_refused_and_leaves_what_is_kept() -> None:
+    collection = MotionCollection()
+    collection.collect(request(), kept(J1=history(700)), 0)
+
+    def more(first: int, count: int, end: int) -> CollectRequest:
+        rows = tuple(
+            RowRange(serial=f"M{first + k}", boot=7, first_row=10, end_row=end) for k in range(count)
+        )
+        return request().model_copy(update={"rows": rows})
+
+    with pytest.raises(WireError, match=r"motion 1 would have \d+ rows of 43 modules"):
+        collection.collect(more(0, MAX_ROWS // MAX_ROWS_PER_MOTION + 1, MAX_ROWS_PER_MOTION), {}, 0)
+    for first in range(0, MAX_MODULES - 4, 4):
+        collection.collect(more(first, 4, 20), {}, 0)
+    for too_many in (more(1000, 4, 20), more(1000, 30, 20)):
+        with pytest.raises(WireError, match=r"motion 1 would have \d+ rows of \d+ modules") as caught:
+            collection.collect(too_many, {}, 0)
+        assert caught.value.reason is Refusal.LIMIT
+    assert refused(collection) is Refusal.BUSY
+    assert set(collection._motions[1]) == {OWN, OTHER} | {f"M{k}" for k in range(MAX_MODULES - 4)}
 
 
 def test_a_refusal_of_one_range_leaves_the_other_motions_of_the_module_open() -> None:
