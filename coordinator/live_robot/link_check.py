@@ -2,12 +2,14 @@
 
 import asyncio
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from coordinator.live_robot.errors import UnfitLink
 from coordinator.live_robot.messenger import Clock, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.recording.recording import ModuleRecord
 
 # This share of the round trips must take at most half a command's lifetime; the keep-alives bridge the rest.
 FIT_FRACTION = 0.8
@@ -22,18 +24,20 @@ async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Cal
     Raises:
         UnfitLink: after `MAX_MEASUREMENTS`, feedback is lost, or commands would be too old on arrival.
     """
-    before = {serial: group.module(serial).rows.end_row for serial in group.serials}
+    # Of a session that is resumed there is what came before.
+    before = {serial: _Received.of(group.module(serial)) for serial in group.serials}
     start_ns = clock()
     for number in range(1, MAX_MEASUREMENTS + 1):
         end_ns = start_ns + number * int(seconds * 1e9)
         await gather_all(_ask_until(group, serial, clock, end_ns) for serial in group.serials)
         span_s = (clock() - start_ns) / 1e9
-        rates = {s: (group.module(s).rows.end_row - before[s]) / span_s for s in group.serials}
-        faults = [fault for s in group.serials if (fault := _fault(group, s, rates[s]))]
+        new = {s: before[s].since(group.module(s)) for s in group.serials}
+        rates = {s: new[s].rows / span_s for s in group.serials}
+        faults = [fault for s in group.serials if (fault := _fault(group, s, rates[s], new[s].trips_ms))]
         if not faults:
             break
     for serial in group.serials:
-        if trips_ms := _trips_ms(group, serial):
+        if trips_ms := new[serial].trips_ms:
             median, most = (float(np.percentile(trips_ms, share)) for share in (50, 95))
             note(
                 f"{serial} ({group.info(serial).module_type}): {rates[serial]:.0f} rows/s, round trip "
@@ -49,13 +53,28 @@ async def _ask_until(group: ModuleGroup, serial: str, clock: Clock, end_ns: int)
         await asyncio.sleep(BETWEEN_S)
 
 
-def _trips_ms(group: ModuleGroup, serial: str) -> list[float]:
-    return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in group.module(serial).round_trips]
+class _Received(NamedTuple):
+    """What has come of a boot of a module: how many rows, and its round trips [ms]."""
+
+    boot: int
+    rows: int
+    trips_ms: list[float]
+
+    @classmethod
+    def of(cls, module: ModuleRecord) -> "_Received":
+        trips_ms = [(trip.received_ns - trip.sent_ns) / 1e6 for trip in module.round_trips]
+        return cls(module.boot, module.rows.count, trips_ms)
+
+    def since(self, module: ModuleRecord) -> "_Received":
+        """Return what has come since then; all of it, of another boot."""
+        now = _Received.of(module)
+        if now.boot != self.boot:
+            return now
+        return _Received(now.boot, now.rows - self.rows, now.trips_ms[len(self.trips_ms) :])
 
 
-def _fault(group: ModuleGroup, serial: str, rate: float) -> str:
+def _fault(group: ModuleGroup, serial: str, rate: float, trips_ms: list[float]) -> str:
     info = group.info(serial)
-    trips_ms = _trips_ms(group, serial)
     if not trips_ms:
         return (
             f"unfit: module {serial} booted anew while the link was checked, or a second module has its "

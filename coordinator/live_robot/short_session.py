@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 
 from coordinator.live_robot import link_check
 from coordinator.live_robot.discovery import MAX_S, Search, await_modules
+from coordinator.live_robot.excluded_modules import FEEDBACK_WAIT_S
 from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender, gather_all
-from coordinator.live_robot.module_group import POLL_S, ModuleGroup
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Recording
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Transport
@@ -48,6 +49,7 @@ class ShortSession:
             await self._meet()
             group = self._group
             gains = chosen([group.info(serial).gains for serial in group.serials])
+            keeper = asyncio.create_task(group.keep_alive())
             try:
                 await gather_all(group.acquire(serial) for serial in group.serials)
                 await gather_all(
@@ -55,6 +57,8 @@ class ShortSession:
                     for serial, own in zip(group.serials, gains, strict=True)
                 )
             finally:
+                keeper.cancel()
+                await asyncio.gather(keeper, return_exceptions=True)
                 await group.release_all()
             return group.serials
         finally:
@@ -76,16 +80,22 @@ class ShortSession:
 
     async def _meet(self) -> None:
         serials, search, group = self._serials, self._search, self._group
+        start_ns = self._clock()
 
         def complete(present: frozenset[str], quiet_s: float) -> bool:
-            wanted = len(serials) if serials else search.expect
-            return len(present) >= wanted if wanted else bool(present) and quiet_s >= search.quiet_s
+            if serials:
+                return set(serials) <= present
+            if search.expect:
+                return len(present) >= search.expect
+            is_over = self._clock() - start_ns >= 1e9 * search.min_s
+            return is_over and bool(present) and quiet_s >= search.quiet_s
 
         present = await await_modules(self._messenger, self._clock, complete, MAX_S)
         if not present or not set(serials) <= present or len(present) < (search.expect or 0):
             there = ", ".join(sorted(present)) or "none"
-            raise RobotError(f"modules of robot {self._name!r} are missing; there are {there}")
+            wanted = f", {search.expect} are expected" if search.expect else ""
+            raise RobotError(f"modules of robot {self._name!r} are missing{wanted}; there are {there}")
         await group.meet(serials or sorted(present))
-        while group.without_feedback():
-            group.check()
-            await asyncio.sleep(POLL_S)
+        if not await group.wait(lambda: not group.without_feedback(), FEEDBACK_WAIT_S):
+            silent = ", ".join(sorted(group.without_feedback()))
+            raise RobotError(f"no feedback comes from {silent}, which answers: restart its agent")

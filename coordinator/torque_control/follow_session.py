@@ -108,7 +108,7 @@ class FollowSession:
         self._name, self._model, self._motion, self._plan = name, model, motion, plan
         self._clock, self._screen = clock, screen
         self._serials = model.chain.serials
-        self._states = StreamedStates(self._group)
+        self._states = StreamedStates(self._group, clock)
         self._stale_s = 0.0
         self._missed = 0
 
@@ -216,12 +216,20 @@ class FollowSession:
         try:
             while not stream.done():
                 self._group.check()
-                await self._group.close_gaps()
-                await asyncio.sleep(POLL_S)
+                filling = asyncio.create_task(self._fill())
+                # Whoever does not answer must not delay the stop of a robot whose guard has ended the stream.
+                await asyncio.wait((stream, filling), return_when=asyncio.FIRST_COMPLETED)
+                if filling.done():
+                    filling.result()
+                await _cancelled(filling)
             stream.result()
         finally:
             await _cancelled(stream)
         await self._group.close_gaps()
+
+    async def _fill(self) -> None:
+        await self._group.close_gaps()
+        await asyncio.sleep(POLL_S)
 
     async def _send(self, points: _SetPoints, mode: InputMode) -> None:
         period_s = 1.0 / self._plan.rate_hz

@@ -98,7 +98,7 @@ class CompensationSession:
         self._asked = ""
         # The number of calls of `end`, and that number when the robot was held.
         self._end_requests = self._end_requests_seen = 0
-        self._states = StreamedStates(self._group)
+        self._states = StreamedStates(self._group, clock)
         self._is_under_torque = False
         self._streaming: asyncio.Task[None] | None = None
 
@@ -144,7 +144,12 @@ class CompensationSession:
         if self._asked:
             return self._tally.summary(self._asked, is_fault=False)
         try:
-            await gather_all(self._group.acquire(serial) for serial in self._serials)
+            # Until the stream renews the leases: none must expire while the next module is slow to answer.
+            keeper = asyncio.create_task(self._group.keep_alive())
+            try:
+                await gather_all(self._group.acquire(serial) for serial in self._serials)
+            finally:
+                await _cancelled(keeper)
             self._streaming = asyncio.create_task(self._stream(compensator))
             await self._compensate(compensator)
             await self._return(compensator, stood.q_rad)

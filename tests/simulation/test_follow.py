@@ -1,5 +1,6 @@
 """Following a motion in virtual time: torque assistance helps, and faults stop the robot."""
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from coordinator.torque_control.gravity_model import GravityModel, gravity_model
 from coordinator.torque_control.motion_file import read_motion
 from coordinator.torque_control.preconditions import RobotMismatch
 from coordinator.torque_control.tracking import MotionRefused
+from module_agent.model.chain import Array
 from sim.robot.robot_file import load_robot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 from tests.rig import Notes, Rig
@@ -154,3 +156,35 @@ def test_a_robot_follows_better_with_what_it_identified_of_itself(
     # Measured: 0.07 times, and half of that; twice as much where the offset is followed.
     assert velocity < 0.35 * position
     assert torque < 0.75 * velocity
+
+
+def test_a_large_error_stops_all_modules_at_once_though_a_module_answers_no_question(
+    rigs: Callable[..., Any], model: GravityModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows that are missing are asked for while set-points are streamed: an answer may take 0.5 s."""
+    rig = rigs(ARM, "lan")
+    following, _ = session(rig, model, motion_file(tmp_path / "m.csv"), FollowPlan(max_error_rad=0.005))
+    guarded_s: list[float] = []
+    guard, close_gaps = following._guard, following._group.close_gaps
+
+    def noted(q_rad: Array) -> None:
+        try:
+            guard(q_rad)
+        except TrackingLost:
+            guarded_s.append(rig.loop.time())
+            raise
+
+    async def unanswered() -> None:
+        await asyncio.sleep(0.5)
+        await close_gaps()
+
+    monkeypatch.setattr(following, "_guard", noted)
+    monkeypatch.setattr(following._group, "close_gaps", unanswered)
+    stopped_s: list[float] = []
+    rig.when(
+        lambda: {rig.state(serial) for serial in rig.serials} == {"stopped"},
+        lambda: stopped_s.append(rig.loop.time()),
+    )
+    with pytest.raises(TrackingLost):
+        rig.run(following.run())
+    assert stopped_s[0] - guarded_s[0] < 0.05

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.live_robot.errors import RobotStopped
+from coordinator.live_robot.errors import ModuleLost, RobotStopped
 from coordinator.live_robot.messenger import Refused, Sender
 from coordinator.torque_control.gravity_compensation import (
     CompensationRefused,
@@ -299,6 +299,48 @@ def test_when_the_host_stalls_the_modules_let_go_by_themselves(rigs: Callable[..
 
 async def _until(rig: Any, t_s: float) -> None:
     await asyncio.sleep(max(0.0, t_s - rig.loop.time()))
+
+
+def test_no_joint_is_off_where_a_module_takes_longer_to_take_than_a_lease_lasts(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan")
+    floating, seen = session(rig, CompensationPlan(for_s=0.3, final_hold_s=0.0, returns=False))
+    acquire = floating._group.acquire
+
+    async def slow(serial: str) -> None:
+        if serial == ELBOW:
+            await asyncio.sleep(0.6)
+        await acquire(serial)
+
+    monkeypatch.setattr(floating._group, "acquire", slow)
+    off: set[str] = set()
+
+    def watch() -> None:
+        off.update(serial for serial in rig.serials if rig.state(serial) == "expired")
+
+    rig.on_tick.append(watch)
+    assert rig.run(floating.run()).why == "the time is over"
+    assert seen.floats
+    assert off == set()
+
+
+def test_a_joint_that_executes_no_set_point_from_the_start_ends_it(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan")
+    floating, _ = session(rig)
+    stream, renew = floating._group.stream, floating._group.renew
+
+    def deaf(serial: str, *aims: float | None) -> None:
+        if serial != LIFT:
+            stream(serial, *aims)
+
+    monkeypatch.setattr(floating._group, "stream", deaf)
+    monkeypatch.setattr(floating._group, "renew", lambda: renew() if rig.loop.time() < 0.5 else None)
+    with pytest.raises(ModuleLost, match=f"module {LIFT} is lost: its motor is off, expired"):
+        rig.run(floating.run())
+    assert {rig.state(serial) for serial in rig.serials} <= {"stopped", "expired"}
 
 
 def test_a_module_that_somebody_holds_is_not_taken_from_him(rigs: Callable[..., Any]) -> None:

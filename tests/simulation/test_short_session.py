@@ -5,15 +5,18 @@ from typing import Any
 
 import pytest
 
-from coordinator.live_robot.discovery import Search
+from coordinator.live_robot.discovery import AS_HUB_S, Search
 from coordinator.live_robot.messenger import Sender
 from coordinator.live_robot.short_session import ShortSession
 from module_agent.model.errors import RobotError
+from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import GainSet
+from sim.virtual_time.network import VirtualEndpoint
 from tests.rig import SECRET
 
 ROBOT = "thesis_171_horizontal"
 SERIALS = ("X-00010", "X-00009")
+ANY = Search()
 
 
 def softer(present: Sequence[GainSet]) -> list[GainSet]:
@@ -23,9 +26,9 @@ def softer(present: Sequence[GainSet]) -> list[GainSet]:
     ]
 
 
-def session(rig: Any, serials: Sequence[str] = ()) -> ShortSession:
+def session(rig: Any, serials: Sequence[str] = (), search: Search = ANY) -> ShortSession:
     clock = rig.endpoint("tester"), ROBOT, lambda: rig.loop.now_ns, rig.loop.call_soon
-    return ShortSession(*clock, Sender("tester", SECRET), Search(), serials)
+    return ShortSession(*clock, Sender("tester", SECRET), search, serials)
 
 
 @pytest.mark.parametrize("rate_hz", [None, 250.0], ids=["direct", "driver"])
@@ -49,6 +52,32 @@ def test_a_module_that_is_not_there_is_named_with_those_that_are(rigs: Callable[
     rig = rigs(ROBOT, "lan")
     with pytest.raises(RobotError, match="there are X-00009, X-00010"):
         rig.run(session(rig, ("X-1",)).load_gains(softer))
+
+
+@pytest.mark.parametrize("named", [(), ("X-00010",)], ids=["all", "named"])
+def test_a_module_that_comes_while_agents_look_for_their_hub_is_waited_for(
+    rigs: Callable[..., Any], named: tuple[str, ...]
+) -> None:
+    rig = rigs(ROBOT, "lan")
+    rig.kill("X-00010")
+    rig.at(1.4, lambda: rig.boot("X-00010"))
+    found = rig.run(session(rig, named, Search(min_s=AS_HUB_S)).load_gains(softer))
+    assert found == (named or ("X-00009", "X-00010"))
+
+
+def test_a_module_that_answers_and_sends_no_feedback_is_named(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish = VirtualEndpoint.publish
+
+    def mute(self: VirtualEndpoint, key: str, payload: bytes) -> None:
+        if parse(key)[1:] != ("X-00010", Leaf.FEEDBACK):
+            publish(self, key, payload)
+
+    monkeypatch.setattr(VirtualEndpoint, "publish", mute)
+    rig = rigs(ROBOT, "lan")
+    with pytest.raises(RobotError, match="no feedback comes from X-00010, which answers"):
+        rig.run(session(rig).check_link(1.0, lambda note: None))
 
 
 @pytest.mark.parametrize("rate_hz", [None, 250.0], ids=["direct", "driver"])

@@ -8,7 +8,8 @@ import pytest
 
 from coordinator.live_robot.errors import UnfitLink
 from coordinator.live_robot.link_check import MAX_MEASUREMENTS, check_link
-from module_agent.network_emulation.profile import PROFILES, NetworkProfile
+from coordinator.recording.recording import RoundTrip
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile, PathProfile
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -77,6 +78,35 @@ def test_a_second_module_with_the_same_serial_is_named_though_it_answers_nothing
         await check_link(group, lambda: rig.loop.now_ns, MEASUREMENT_S, lambda note: None)
 
     with pytest.raises(UnfitLink, match=rf"unfit: module {TIP} booted anew .* or a second module has its"):
+        rig.run(work())
+
+
+def test_feedback_that_the_network_loses_is_unfit(rigs: Callable[..., Any]) -> None:
+    """Rows are numbered: the newest number alone does not tell how many have come."""
+    losing = PROFILES["lan"].model_copy(update={"to_coordinator": PathProfile(loss=0.7)})
+    rig = rigs(ARM, losing)
+    with pytest.raises(UnfitLink, match=r"delivers \d\d? rows/s of 250"):
+        _checked(rig, SECOND_S)
+
+
+@pytest.mark.parametrize("delay_ms", [0.1, 150.0])
+def test_what_came_before_the_check_does_not_count(rigs: Callable[..., Any], delay_ms: float) -> None:
+    """A session that is resumed after its network was mended, or has broken, has its old round trips."""
+    rig = rigs(ARM, NetworkProfile(name="now", delay_ms=delay_ms))
+    _, recording, group = rig.group()
+    old_ns = 1_000_000 if delay_ms > 1.0 else 400_000_000
+
+    async def work() -> None:
+        await asyncio.sleep(0.5)
+        await group.meet((BASE, TIP))
+        for serial in (BASE, TIP):
+            recording.modules[serial].round_trips += [RoundTrip(0, old_ns, 0)] * 3000
+        await check_link(group, lambda: rig.loop.now_ns, MEASUREMENT_S, lambda note: None)
+
+    if delay_ms > 1.0:
+        with pytest.raises(UnfitLink, match="one in five takes more than 30"):
+            rig.run(work())
+    else:
         rig.run(work())
 
 
