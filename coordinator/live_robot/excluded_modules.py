@@ -64,14 +64,20 @@ class ExcludedModules:
         self._exclude(serial, str(error), by_limits=beyond)
         return True
 
-    def look_again(self) -> None:
-        """Note the modules refused by their limits that hold their joint no longer: it may have swung."""
+    def look_again(self) -> list[str]:
+        """Note and return the modules refused by their limits that hold their joint no longer.
+
+        It may have swung.
+        """
+        gone = []
         for serial in sorted(self._well):
             status = self._group.status_under_lease(serial)
             if status is not None and status.state in ("fault", "expired"):
                 reason = f": {status.note}" if status.note else ""
                 text = f"it did not hold its joint to the end: its state is {status.state}{reason}"
                 self._exclude(serial, text)
+                gone.append(serial)
+        return gone
 
     def _exclude(self, serial: str, why: str, by_limits: bool = False) -> None:
         self.why[serial] = why

@@ -274,6 +274,10 @@ class ModuleGroup:
         # Its lifetime counts from the echo in the request: on a slow network little of it is left.
         self._send(self._renew(serial))
 
+    def forget_lease(self, serial: str) -> None:
+        """Renew the lease of a module no more, which lapses then, and expect nothing of it."""
+        self._tokens.pop(serial, None)
+
     async def keep_alive(self) -> None:
         """Renew all leases until cancelled; a late answer does not hold up the next renewal.
 

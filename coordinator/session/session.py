@@ -104,6 +104,7 @@ class Session:
         self._messenger = messenger
         self._recording = recording
         self._plan = plan
+        self._speed_rad_s = plan.travel_speed_rad_s
         self._clock = clock
         self._journal = journal
         self._reporter = reporter
@@ -135,7 +136,7 @@ class Session:
         await check_link(self.group, self._clock, self._plan.link_s, self._reporter.note)
         self._total = 2 + self._steps()
         self._begin_anew_if_changed()
-        self._invalidate_steps_before_boot()
+        self._repeat_journeys()
         self._starts = {s: self._position(s) for s in self.group.serials}
         self._times = self._expected()
         try:
@@ -178,8 +179,11 @@ class Session:
             ModulesJoined: modules have come, and the robot stands still.
         """
         if self._plan.trial_speed_rad_s is not None:
+            # The ways home of the attempts that follow an interrupted one, too.
+            self._speed_rad_s = self._plan.trial_speed_rad_s
             work = partial(self._try_slowly, self._plan.trial_speed_rad_s)
             await self._step("trial", "every joint slowly, a little", work)
+        self._speed_rad_s = self._plan.travel_speed_rad_s
         await self._step_unless_excluded("home", "all joints to their home position", self._home)
         await self._step("rest", "listening at rest", self._rest)
         if self._plan.mode == "simultaneous":
@@ -232,14 +236,22 @@ class Session:
         self._times = self._expected()
 
     def _begin_anew_if_changed(self) -> None:
-        """Keep no step of a session that is resumed if the robot has other modules now than it had then."""
+        """Keep no step of a session that is resumed if the robot is not as it was then.
+
+        It may have other modules. One that has booted since may have lost its zero, and what it measured of
+        the others' motions is of its earlier boot.
+        """
         journal = self._recording.journal
-        rested = {e.serial for e in since_joined(journal) if e.what == "motion" and e.purpose == "rest"}
+        rested = {
+            e.serial: e.boot for e in since_joined(journal) if e.what == "motion" and e.purpose == "rest"
+        }
         here = set(self.group.serials)
-        come = sorted(here - rested - refused_by_limits(journal))
-        gone = sorted(rested - here)
-        if rested and (come or gone):
-            changes = [f"{serial} came" for serial in come] + [f"{serial} went" for serial in gone]
+        changes = [f"{s} came" for s in sorted(here - rested.keys() - refused_by_limits(journal))]
+        changes += [f"{s} went" for s in sorted(rested.keys() - here)]
+        changes += [
+            f"{s} booted" for s in sorted(here & rested.keys()) if rested[s] != self.group.module(s).boot
+        ]
+        if rested and changes:
             self._note_anew(f"since the session before {', '.join(changes)}: the robot is measured anew")
 
     def _note_anew(self, text: str) -> None:
@@ -270,14 +282,8 @@ class Session:
             self.group.kind(serial)
         self._reporter.note(f"found {len(self.group.serials)}: {', '.join(self.group.serials)}")
 
-    def _invalidate_steps_before_boot(self) -> None:
-        """Repeat steps whose module has booted since: its zero may have moved."""
-        moved = [e for e in self._recording.journal if e.what == "motion"]
-        for event in [*self._done.values(), *moved]:
-            record = self._recording.modules.get(event.serial)
-            rebooted = event.serial and (record is None or record.boot != event.boot)
-            if rebooted and self._done.pop(event.step, None) is not None:
-                self._reporter.note(f"{event.step} is done again: module {event.serial} has booted since")
+    def _repeat_journeys(self) -> None:
+        """Do the steps again that bring the robot to where it is measured, and back."""
         for journey in ("home", "back"):
             self._done.pop(journey, None)
         if self._done:
@@ -340,8 +346,18 @@ class Session:
         self._journal(exclusion_event(self._clock(), serial, why, by_limits))
 
     async def _rearm(self) -> None:
-        await self._arm()
-        await self._home()
+        """Take the modules again and go home, without those that refuse or cannot."""
+        while True:
+            # An excluded module that has let go of its joint interrupts no other one.
+            for serial in self._excluded.look_again():
+                self.group.forget_lease(serial)
+            try:
+                await self._arm()
+                await self._home()
+                return
+            except (Refused, MotionInterrupted) as error:
+                if not self._excluded.without(error):
+                    raise
 
     async def _finish(self) -> None:
         speed = self._plan.travel_speed_rad_s
@@ -562,7 +578,7 @@ class Session:
     # ------------------------------------------------------------------ pieces
 
     async def _go(self, targets_rad: Mapping[str, float], speed_rad_s: float | None = None) -> None:
-        speed = speed_rad_s or self._plan.travel_speed_rad_s
+        speed = speed_rad_s or self._speed_rad_s
         await self.group.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
         await asyncio.sleep(self._plan.settle_s)
 

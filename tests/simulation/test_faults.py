@@ -234,6 +234,22 @@ def test_a_run_whose_coordinator_is_killed_is_resumed_and_ends_right(
     assert json.loads((out / "result.json").read_text())["serials"] == [BASE, TIP]
 
 
+@pytest.mark.parametrize("victim", [BASE, TIP])
+def test_a_run_is_resumed_though_a_module_has_booted_since(
+    rigs: Rigs, quick_plan: Plan, tmp_path: Path, victim: str
+) -> None:
+    """What it measured of the others' motions is of its earlier boot: all is measured anew."""
+    rig = rigs(ARM, "lan", 5)
+    out = tmp_path / "run"
+    _crash(rig, out, quick_plan, lambda: any("joint X-00010" in note for note in rig.notes))
+    rig.kill(victim)
+    rig.boot(victim)
+    rig.session(out, quick_plan, resume=True, sender="successor")
+    _right(out)
+    said = f"since the session before {victim} booted: the robot is measured anew"
+    assert any(said in note for note in rig.notes)
+
+
 @pytest.mark.parametrize(
     "break_s", [pytest.param(1.0, id="at once"), pytest.param(90.0, id="when its rows are forgotten")]
 )

@@ -10,11 +10,13 @@ import pytest
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.topology_search import TopologyFound, doubtful_motions, search_topology
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.journal import JournalEvent, missing_modules
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.session.session import NoModulesFound, Session
 from coordinator.topology.next_motion import NextMotion
 from module_agent.wire.keys import Leaf, parse
+from module_agent.wire.messages import GoTo
 from sim.benchmark.cases.topology import PLAN, topology_trial
 from sim.virtual_time.network import VirtualEndpoint
 
@@ -224,6 +226,63 @@ def test_a_joint_whose_limits_forbid_the_motion_is_named_and_all_else_is_explore
     # It is well, and there: what it refuses is no reason to doubt the others.
     assert any(note.startswith("elbow took no part") for note in found.notes)
     assert found.missing == ()
+
+
+def test_a_pause_of_the_network_is_survived_though_a_joint_has_been_excluded(arm: Any) -> None:
+    """All motors let go, that of the excluded joint too: nobody takes it again, nor waits for it."""
+    narrow_elbow(arm)
+
+    def part(text: str) -> None:
+        if text == "exploring joint wrist":
+            arm.at(arm.loop.time() + 1.0, lambda: setattr(arm, "cut", True))
+            arm.at(arm.loop.time() + 1.35, lambda: setattr(arm, "cut", False))
+
+    recording, _ = explore(arm, on_step=part)
+    assert any(e.what == "done" and e.step == "explore/wrist" for e in recording.journal)
+    assert recording.journal[-1].step == "back"
+    (missing,) = search_topology(recording, rested(recording)).missing
+    assert missing.startswith(
+        "elbow took no part: it did not hold its joint to the end: its state is expired"
+    )
+
+
+def test_two_joints_that_may_not_go_home_are_left_out(arm: Any) -> None:
+    for serial in ("elbow", "wrist"):
+        limits = arm.hosts[serial].modules[0].firmware.config.limits
+        away = limits.model_copy(update={"min_position_rad": 0.5, "max_position_rad": 1.5})
+        arm.kill(serial)
+        arm.boot(serial, limits=away)
+    recording, watcher = explore(arm)
+    assert {note.split(":")[0] for note in watcher.notes if note.startswith("going on without")} == {
+        "going on without elbow",
+        "going on without wrist",
+    }
+    assert {e.serial for e in recording.journal if e.purpose == "constant"} == {"yaw", "lift"}
+
+
+def test_the_way_home_after_an_interrupted_trial_is_as_slow_as_the_trial(
+    arm: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    speeds: dict[bool, set[float]] = {True: set(), False: set()}
+    run, tried, cut = ModuleGroup.run, [False], [False]
+
+    async def noted(self: ModuleGroup, patterns: Any, *rest: Any) -> Any:
+        speeds[tried[0]] |= {one.max_speed_rad_s for one in patterns.values() if isinstance(one, GoTo)}
+        return await run(self, patterns, *rest)
+
+    def part(text: str) -> None:
+        tried[0] = tried[0] or text == "all joints to their home position"
+        if text == "every joint slowly, a little" and not cut[0]:
+            cut[0] = True
+            arm.at(arm.loop.time() + 1.0, lambda: setattr(arm, "cut", True))
+            arm.at(arm.loop.time() + 1.35, lambda: setattr(arm, "cut", False))
+
+    monkeypatch.setattr(ModuleGroup, "run", noted)
+    plan = PLAN.model_copy(update={"trial_speed_rad_s": 0.2})
+    _, watcher = explore(arm, plan, part)
+    assert any("re-arming and trying again" in note for note in watcher.notes)
+    assert speeds[False] == {0.2}
+    assert plan.travel_speed_rad_s in speeds[True]
 
 
 def test_a_module_that_its_limits_excluded_and_that_lets_go_of_its_joint_later_is_missing(arm: Any) -> None:
