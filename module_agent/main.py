@@ -24,7 +24,7 @@ from module_agent.hardware.hebi_library import library as hebi_library
 from module_agent.hardware.hebi_network import HebiOptions, open_modules, seen
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import ImuKind
-from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
+from module_agent.model.errors import EXIT_FAILED, EXIT_LOST, EXIT_USAGE, RobotError, UsageError
 from module_agent.model.settings import read_settings, variable
 from module_agent.model.version import installed_version
 from module_agent.network_emulation.impaired_transport import inject
@@ -286,6 +286,7 @@ def _list(library: str) -> None:
         typer.echo(
             "x5-agent: no HEBI module answers: is this host on their network, and are they on?", err=True
         )
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _serve(host: "AgentHost", worker: ThreadWorker) -> None:

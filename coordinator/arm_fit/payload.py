@@ -12,6 +12,7 @@ are whitened, so that psi's covariance contains the uncertainty of the arm (`par
 
 from base64 import b64decode, b64encode
 from binascii import Error as Base64Error
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from scipy.linalg import null_space
 from scipy.special import chdtrc, ndtri
 
 from coordinator.arm_fit.problem import Problem
+from coordinator.arm_fit.recordings import STILL
 from coordinator.arm_fit.report import FitReport, InformationPart, JointPlacePart, PayloadPart
 from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.pseudo_inertia import (
@@ -128,7 +130,7 @@ def read_baseline(
     part = report.information
     if part is None:
         raise UsageError(f"{name}: it was written without the information of its fit; fit it again")
-    _check_same_arm(name, part, robot)
+    _check_same_arm(name, part, report.recording.held, robot)
     link = robot.bodies[-1] if link is None else link
     _check_carried(robot, link)
     target = _decoded(name, part.target)
@@ -302,13 +304,20 @@ def _check_carried(robot: UrdfRobot, link: str) -> None:
         )
 
 
-def _check_same_arm(name: str, part: InformationPart, robot: UrdfRobot) -> None:
+def _check_same_arm(name: str, part: InformationPart, held: Mapping[str, float], robot: UrdfRobot) -> None:
     there, here = [p.joint for p in part.joints], list(robot.chain.serials)
     if there != here:
         raise UsageError(
             f"{name}: a fit of the joints {', '.join(there)}; those that move in this recording are "
             f"{', '.join(here)}; a baseline is a fit of the same joints"
         )
+    for joint, position in robot.held.items():
+        if abs(position - held.get(joint, 0.0)) > STILL:
+            raise UsageError(
+                f"{name}: joint {joint!r} stood at {held.get(joint, 0.0):.3g} (rad or m), and stands at "
+                f"{position:.3g} in this recording: what it carries would count as payload; record both "
+                "with it at the same position"
+            )
     for old, new in zip(part.joints, _places(robot), strict=True):
         moved = float(np.linalg.norm(np.subtract(old.origin_m, new.origin_m)))
         turned = float(np.linalg.norm(np.subtract(old.axis, new.axis)))

@@ -16,7 +16,7 @@ from module_agent.model.read_only import read_only
 Source = str | Path | JointLog
 
 # A joint that stays within this is held: what moves it is the give of a controller, not a motion.
-_STILL_RAD = 0.01
+STILL = 0.01
 
 
 class Recordings(NamedTuple):
@@ -61,10 +61,10 @@ def read_recordings(
     if checked and (texts := [text for log in logs for text in wrong_motion(robot, log)]):
         raise DataFileError("\n".join(texts))
     log = joined([at_rate(log, max(log.rate_hz for log in logs)) for log in logs])
-    still = np.ptp(log.q_rad, axis=0) < _STILL_RAD
+    still = np.ptp(log.q_rad, axis=0) < STILL
     if still.all():
         raise UsageError(
-            f"{log.file}: no joint moves by more than {_STILL_RAD} rad; record a motion of all joints"
+            f"{log.file}: no joint moves by more than {STILL} rad; record a motion of all joints"
         )
     if still.any():
         held = {joints[i]: float(log.q_rad[:, i].mean()) for i in np.flatnonzero(still)}
@@ -85,7 +85,7 @@ def read_other(recordings: Recordings, source: Source) -> JointLog:
     for name, position in recordings.robot.held.items():
         if name in recordings.joints:
             off = np.abs(log.q_rad[:, recordings.joints.index(name)] - position).max()
-            if off > _STILL_RAD:
+            if off > STILL:
                 raise UsageError(
                     f"{log.column('q', name)}: {off:.3g} rad from the {position:.3g} rad at which it stood "
                     "still in the other recording; give both as --data"

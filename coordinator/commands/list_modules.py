@@ -31,7 +31,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
         print_table(_table(place.robot, found, delays))
         if found.cpu_us_per_message is not None:
             Terminal(at.quiet).note(
-                f"{found.cpu_us_per_message:.0f} us of processor time a message received here"
+                f"{found.cpu_us_per_message:.0f} us of CPU time for each message received here"
             )
     _check(place.robot, len(found.statuses), expect, "status", found.silent)
 

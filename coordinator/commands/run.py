@@ -188,7 +188,7 @@ def resuming(context: typer.Context) -> str:
 
 def print_result(result: Result, terminal: Terminal) -> None:
     """Print the links, what is not identifiable, and how well the inertial parameters predict."""
-    table = new_table(f"{result.robot}: links", "parent | child | link length [mm] | +-")
+    table = new_table(f"{result.robot}: links", "parent | child | axis to IMU [mm] | +-")
     for link in result.links:
         sigma = link.link_length_sigma_mm
         length = None if sigma is None else link.link_length_mm

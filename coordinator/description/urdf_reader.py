@@ -183,6 +183,31 @@ def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float
         if link is None or link not in links:
             raise UrdfError(f"joint {name!r} has {end} {link!r}, and no link has that name")
         ends.append(link)
+    axis, pose = _axis(element, name, kind), joint_pose(element, 0.0)
+    limits = _limits(element, name, kind)
+    if kind == "fixed" or (kind in _MOVING and name not in held and element.find("mimic") is None):
+        return UrdfJoint(name, ends[0], ends[1], kind in _MOVING, pose, axis, limits, None)
+    position = float(held.get(name, 0.0))
+    return UrdfJoint(name, ends[0], ends[1], False, joint_pose(element, position), axis, limits, position)
+
+
+def joint_pose(element: Element, position: float) -> Array:
+    """Return the pose (4, 4) of a joint's child in its parent, the joint at a position [rad, m].
+
+    Raises:
+        UrdfError: an origin or an axis that is none.
+    """
+    name, kind = _name(element), element.get("type", "")
+    displaced = np.eye(4)
+    if kind == "prismatic":
+        displaced[:3, 3] = position * _axis(element, name, kind)
+    elif kind != "fixed":
+        displaced[:3, :3] = Rotation.from_rotvec(position * _axis(element, name, kind)).as_matrix()
+    pose: Array = element_pose(element.find("origin"), f"origin of joint {name!r}") @ displaced
+    return pose
+
+
+def _axis(element: Element, name: str, kind: str) -> Array:
     axis_element = element.find("axis")
     axis = np.array([1.0, 0.0, 0.0])
     if axis_element is not None:
@@ -190,17 +215,7 @@ def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float
     length = float(np.linalg.norm(axis))
     if kind != "fixed" and not length > 1e-9:
         raise UrdfError(f"axis of joint {name!r} is zero; it must be a direction")
-    pose = element_pose(element.find("origin"), f"origin of joint {name!r}")
-    axis, limits = axis / max(length, 1e-9), _limits(element, name, kind)
-    if kind == "fixed" or (kind in _MOVING and name not in held and element.find("mimic") is None):
-        return UrdfJoint(name, ends[0], ends[1], kind in _MOVING, pose, axis, limits, None)
-    position = float(held.get(name, 0.0))
-    displaced = np.eye(4)
-    if kind == "prismatic":
-        displaced[:3, 3] = position * axis
-    else:
-        displaced[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
-    return UrdfJoint(name, ends[0], ends[1], False, pose @ displaced, axis, limits, position)
+    return axis / max(length, 1e-9)
 
 
 def _drives(root: Element, names: Sequence[str]) -> Array:

@@ -16,8 +16,8 @@ from xml.etree.ElementTree import (
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.description.urdf_reader import DRAKE, UrdfRobot
-from coordinator.description.urdf_writer import inertial_element
+from coordinator.description.urdf_reader import DRAKE, UrdfRobot, joint_pose
+from coordinator.description.urdf_writer import inertial_element, origin_of
 from coordinator.dynamics.pseudo_inertia import Body
 
 
@@ -27,8 +27,9 @@ def fitted_urdf_text(
     """Return the text of a robot's URDF with other bodies, friction and rotors.
 
     The inertia of a body is in the link right behind its joint; links fixed to that lose their own, which is
-    contained in it. Joints get viscous and Coulomb friction, and a transmission with the rotor's inertia
-    behind the gear, as Drake reads it.
+    contained in it. So do links behind a joint that was held for the fit, which becomes fixed where it was.
+    The other joints get viscous and Coulomb friction, and a transmission with the rotor's inertia behind the
+    gear, as Drake reads it.
 
     Args:
         robot: of `read_urdf`, whose file is read again. bodies: (n,) in the frames of the links
@@ -53,8 +54,12 @@ def fitted_urdf_text(
         if (joint := one.find("joint")) is not None
     }
     values = dict(zip(robot.chain.serials, np.asarray(drives).tolist(), strict=True))
+    fixed = []
     for joint in root.findall("joint"):
         name = joint.get("name", "")
+        if name in robot.held:
+            _fix(joint, robot.held[name])
+            fixed.append(name)
         if name in values:
             rotor, damping, friction = values[name]
             for old in joint.findall("dynamics"):
@@ -65,8 +70,19 @@ def fitted_urdf_text(
     indent(root)
     comment = "Inertias, friction and rotors (kg m^2, behind the gear) were identified from torques."
     lacks = f" Identified, but not in this file: {', '.join(lacking)}." if lacking else ""
-    root.insert(0, Comment(f" {comment}{lacks} "))
+    held = f" Fixed, as they were held: {', '.join(fixed)}." if fixed else ""
+    root.insert(0, Comment(f" {comment}{held}{lacks} "))
     return str(tostring(root, encoding="utf-8", xml_declaration=True), "utf-8")
+
+
+def _fix(joint: Element, position: float) -> None:
+    """Fix a joint at a position [rad, m]; what only a moving one has goes."""
+    pose = joint_pose(joint, position)
+    joint.set("type", "fixed")
+    for part in list(joint):
+        if part.tag not in ("parent", "child"):
+            joint.remove(part)
+    SubElement(joint, "origin", origin_of(pose))
 
 
 def _set_rotor(root: Element, transmission: Element | None, joint: str, inertia: float) -> None:

@@ -10,6 +10,7 @@ Shapes are for drawing and for planners: a box for every housing, a cylinder for
 to touch. What a link truly looks like is not identified.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -174,7 +175,7 @@ def _add_shapes(bodies: Mapping[int, Element], homes: Array, chain: Chain, place
 def _add_shape(link: Element, name: str, pose: Array, shape: Element) -> None:
     for use in ("visual", "collision"):
         one = SubElement(link, use, name=f"{use}_{name}")
-        SubElement(one, "origin", _origin(pose))
+        SubElement(one, "origin", origin_of(pose))
         SubElement(one, "geometry").append(shape)
 
 
@@ -212,11 +213,12 @@ def _joint(robot: Element, name: str, kind: str, parent: str, child: str, pose: 
     joint = SubElement(robot, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
-    SubElement(joint, "origin", _origin(pose))
+    SubElement(joint, "origin", origin_of(pose))
     return joint
 
 
-def _origin(pose: Array) -> dict[str, str]:
+def origin_of(pose: Array) -> dict[str, str]:
+    """Return the attributes of the origin of a pose (4, 4)."""
     # URDF turns about the fixed x, y and z in this order. At a pitch of 90 degrees roll and yaw are one
     # angle: any split of it is right, so the warning is suppressed.
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", suppress_warnings=True)
@@ -265,7 +267,7 @@ def comment_undetermined(parent: Element, names: Sequence[str]) -> None:
 
 def comment(parent: Element, text: str) -> None:
     """Add a comment, in which XML allows no double hyphen."""
-    parent.append(Comment(f" {text.replace('--', '- -')} "))
+    parent.append(Comment(f" {re.sub('-(?=-)', '- ', text)} "))
 
 
 def numbers(values: ArrayLike) -> str:

@@ -130,7 +130,7 @@ def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:
     friction is part of b, and gravity is straight to first order.
 
     Raises:
-        ValueError: a motion that is too short for the low-pass.
+        DataError: a motion that is too short for the low-pass.
     """
     q, rate, acceleration, (tau,), _ = filtered_signals(q_rad, [tau_nm], rate_hz, HELD_JOINT_CUTOFF_HZ)
     edge = settling_samples(rate_hz, HELD_JOINT_CUTOFF_HZ) // 2

@@ -33,13 +33,15 @@ def at_instants(signals: Mapping[str, Signals], rate_hz: float) -> Instants:
     """Return all modules' signals at common instants, from the first to the last sample of any module.
 
     Raises:
-        UsageError: the rate is not positive, or above `MAX_RATE_HZ`.
+        UsageError: the rate is not positive, above `MAX_RATE_HZ`, or too low for any instant to be recorded.
     """
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
         raise UsageError(f"{rate_hz} instants per second: between 0 and {MAX_RATE_HZ:g} are needed")
     # Whole multiples of the period, so that runs and modules share the instants.
     first = np.ceil(min(each.t_s[0] for each in signals.values()) * rate_hz)
     last = np.floor(max(each.t_s[-1] for each in signals.values()) * rate_hz)
+    if last < first:
+        raise UsageError(f"{rate_hz:g} instants per second: the recording is too short to have one of them")
     t_s = np.arange(first, last + 1.0) / rate_hz
     return Instants(t_s, {serial: _interpolated(each, t_s) for serial, each in signals.items()})
 

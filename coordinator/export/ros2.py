@@ -10,6 +10,7 @@
 """
 
 from collections.abc import Sequence
+from itertools import chain, count
 from types import TracebackType
 from typing import IO, Any, Self
 
@@ -56,6 +57,7 @@ class Ros2Writer:
         self._writer = Writer(file)
         self._writer.add_metadata("x5", about)
         self._schemas: dict[str, Any] = {}
+        self._tokens: dict[str, str] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -91,7 +93,7 @@ class Ros2Writer:
             "linear_acceleration": _vector(accel_m_s2),
             "linear_acceleration_covariance": _UNKNOWN,
         }
-        self._write(f"/imu/{ros_name(serial)}", "sensor_msgs/Imu", stamp_ns, message)
+        self._write(f"/imu/{self._token(serial)}", "sensor_msgs/Imu", stamp_ns, message)
 
     def others(self, stamp_ns: int, serial: str, values: Sequence[float]) -> None:
         """Write what no standard message has a place for."""
@@ -117,6 +119,14 @@ class Ros2Writer:
         ]
         topic = "/tf_static" if fixed else "/tf"
         self._write(topic, "tf2_msgs/TFMessage", stamp_ns, {"transforms": messages})
+
+    def _token(self, serial: str) -> str:
+        """Return a module's token in names of topics: no two modules share one."""
+        if serial not in self._tokens:
+            token, taken = ros_name(serial), set(self._tokens.values())
+            numbered = (f"{token}_{number}" for number in count(2))
+            self._tokens[serial] = next(name for name in chain([token], numbered) if name not in taken)
+        return self._tokens[serial]
 
     def _write(self, topic: str, name: str, stamp_ns: int, message: object) -> None:
         if name not in self._schemas:

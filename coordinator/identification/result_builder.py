@@ -142,7 +142,13 @@ def _unresolved(fit: ChainEstimate, types: list[ModuleType], item: Unresolved) -
     ]
     short = [", ".join(name.split("_")[0] for name in link.parameters) for link in links]
     of = [f"{names} of the link {p.parent} - {p.child}" for names, p in zip(short, links, strict=True)]
-    where = f"{' and '.join(of)}: " if of else ""
+    count = item.directions.shape[1]
+    named = sum(map(len, (link.parameters for link in links)))
+    # One unknown rotation shows in several parameters, whose other combinations are known.
+    together = (
+        f" ({count} {'combination' if count == 1 else 'combinations'} of them)" if named > count else ""
+    )
+    where = f"{' and '.join(of)}{together}: " if of else ""
     summary = f"{where}{item.text}. What would tell it: {item.resolved_by}"
     return UnresolvedPart.of(item, summary=summary, links=links)
 

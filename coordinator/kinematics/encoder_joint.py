@@ -34,8 +34,11 @@ def link_from_joint(
         prior: how well the IMUs are known.
 
     Raises:
-        ValueError: too few samples, uneven times, or an IMU that did not move with the joint.
+        DataError: too few samples, uneven times, or an IMU that did not move with the joint.
+        ValueError: one of the carrier's two signals without the other.
     """
+    if (carrier_gyro_rad_s is None) != (carrier_accel_m_s2 is None):
+        raise ValueError("of the carrier's IMU both gyro and accelerometer are needed, or neither")
     t_ns = np.round(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     q = np.asarray(position_rad, dtype=float)
     joint = JointWindow(t_ns, q, np.gradient(q, 1e-9 * t_ns))

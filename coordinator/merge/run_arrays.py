@@ -7,13 +7,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from module_agent.model.errors import DataError, RobotError
+from module_agent.model.errors import DataError, UsageError
 from module_agent.model.files import replacing
 
 _Read = TypeVar("_Read")
 
 
-class RunArraysError(RobotError):
+class RunArraysError(UsageError):
     """A file of a run is missing, damaged or of another version; the message names it."""
 
 

@@ -4,6 +4,7 @@ A RobotError is raised for what may go wrong with a correct program. Everything 
 is a programming error and ends it with a traceback; a RobotError is therefore never a ValueError.
 """
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -11,7 +12,7 @@ EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_SUSPECT, EXIT_INTERRUPTED
 # What the codes of all programs mean; 128 + n is the end by signal n.
 EXIT_CODES = {
     0: "done",
-    EXIT_FAILED: "failed: the last line says why, and what is kept",
+    EXIT_FAILED: "failed: a line that begins with the program's name says why, and what is kept",
     EXIT_USAGE: "wrong usage: an option, a path or a file cannot be used; nothing was begun",
     EXIT_LOST: "a module was lost; it is named",
     EXIT_FINDING: "done, and found something: a change, a collision, a missed bar",
@@ -43,8 +44,28 @@ class DataError(RobotError):
     """The measurements do not answer what is asked: they are too few, too weak, contradictory or damaged."""
 
 
+# What the system says of paths that no program could use.
+_OF_PATHS = {
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+}
+
+
 class FileError(RobotError):
-    """A file or folder cannot be read or written; the message names it, and has the system's reason."""
+    """A file or folder cannot be read or written; the message names it, and has the system's reason.
+
+    Where its path cannot be used, that is wrong usage.
+    """
+
+    def __init__(self, error: OSError):
+        super().__init__(f"cannot use {error.filename}: {error.strerror}")
+        self.exit_code = EXIT_USAGE if error.errno in _OF_PATHS else EXIT_FAILED
 
 
 @contextmanager
@@ -59,4 +80,4 @@ def named_files() -> Iterator[None]:
     except OSError as error:
         if error.filename is None:
             raise
-        raise FileError(f"cannot use {error.filename}: {error.strerror}") from error
+        raise FileError(error) from error

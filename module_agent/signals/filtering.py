@@ -224,7 +224,7 @@ def filtered_signals(
         late_s: delays the positions, to match other signals that are late.
 
     Raises:
-        ValueError: as `zero_phase_low_pass`.
+        DataError: as `zero_phase_low_pass`.
     """
     edge = settling_samples(rate_hz, cutoff_hz)
     q, *filtered = (zero_phase_low_pass(signal, rate_hz, cutoff_hz) for signal in (q_rad, *others))

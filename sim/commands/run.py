@@ -18,6 +18,7 @@ from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
 from coordinator.runtime.terminal import Terminal
 from coordinator.viewer.targets import NATIVE_PORT, SERVE_PORT, proxy_url, viewer_choice
 from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_SUSPECT, UsageError
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import score_run
 from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError, default_processes
@@ -56,6 +57,15 @@ def run(
         )
     robot = load(settings.robot)
     launched.check()
+    unused = {
+        "--secure": launched.secure is not None,
+        "--processes": launched.processes is not None,
+        "--listen": launched.listen != DEFAULT_ENDPOINT,
+        "--speed": settings.speed != 1.0,
+    }
+    if any(unused.values()):
+        names = ", ".join(name for name, given in unused.items() if given)
+        _note(f"x5-sim: {names}: not used, since with --virtual all is in one process, without a network")
     config = VirtualConfig(
         robot=robot,
         seed=settings.seed,

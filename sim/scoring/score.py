@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart, migrate
 from module_agent.model.chain import Array, Chain, ChainError
-from module_agent.model.errors import DataError, RobotError
+from module_agent.model.errors import DataError, UsageError
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import (
     gravity_error_deg,
@@ -35,7 +35,7 @@ from sim.world.truth import Motion, read_motion, read_truth
 MIN_TORQUE_NM = 0.02
 
 
-class ScoreError(RobotError):
+class ScoreError(UsageError):
     """A run cannot be scored; the message names the file and what is wrong with it."""
 
 

@@ -75,7 +75,7 @@ def simulate(
         plan: the motions; by default the standard ones, with IMU priors that fit the noise profile.
         dynamics: whether to identify inertial parameters [kg, kg m, kg m^2] too; by default as planned.
         pushes: external forces [N] and torques [Nm] on modules.
-        imu_rate_hz: how often the IMUs are read, 1000 Hz by a whole number.
+        imu_rate_hz: how often the IMUs are read, 1000 Hz divided by a whole number.
         physics: engine that moves the bodies; by default compiled, pybullet where there are obstacles.
         out: folder to write the run to (`session.mcap`, `result.json`, `truth.json`, ...), as
             `x5-sim run --virtual` does; nothing is written when None.

@@ -38,7 +38,9 @@ def check_imu_rate(rate_hz: float) -> float:
         UsageError: its period is not a whole number of ticks.
     """
     if not (rate_hz > 0.0 and math.isclose(1.0, TICK_S * rate_hz * round(1.0 / (TICK_S * rate_hz)))):
-        raise UsageError(f"IMU rate {rate_hz:g} Hz: it must be 1000 Hz by a whole number, as 50 or 500 Hz")
+        raise UsageError(
+            f"IMU rate {rate_hz:g} Hz: it must be 1000 Hz divided by a whole number, as 50 or 500 Hz"
+        )
     return rate_hz
 
 

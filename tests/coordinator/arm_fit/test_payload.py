@@ -214,3 +214,17 @@ def test_a_baseline_that_does_not_fit_is_refused_by_name(
         fit(recorded.urdf, recorded.loaded, baseline=damaged)
     with pytest.raises(UsageError, match="without the information of its fit"):
         fit(recorded.urdf, recorded.loaded, baseline=report.model_copy(update={"information": None}))
+
+
+def test_a_baseline_in_which_a_still_joint_stood_elsewhere_is_refused(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """What it carries has turned with it, and would count as a payload."""
+    report = tmp_path / "fit.json"
+    for name, npz, last_rad in (("without", recorded.without, 0.0), ("with", recorded.loaded, 1.57)):
+        arrays = dict(np.load(npz))
+        arrays["position_rad"][:, 5] = last_rad
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+    write_report(report, fit(recorded.urdf, tmp_path / "without.npz").report)
+    with pytest.raises(UsageError, match=r"joint 'j6' stood at 0 \(rad or m\), and stands at 1\.57"):
+        fit(recorded.urdf, tmp_path / "with.npz", baseline=report)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from coordinator.description.urdf_writer import link_homes, robot_element, write_urdf
+from coordinator.description.urdf_writer import comment, link_homes, robot_element, write_urdf
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import body_displacements, imu_poses
@@ -146,3 +146,11 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"robot\.urdf\.part"):
         write_urdf(path, chain, None, "another")
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("serial", ["a-b", "a--b", "a---b", "a----"])
+def test_a_comment_may_have_any_serial(serial: str) -> None:
+    """XML allows no double hyphen in it."""
+    robot = ElementTree.Element("robot")
+    comment(robot, f"order: {serial}")
+    assert ElementTree.fromstring(ElementTree.tostring(robot)).tag == "robot"

@@ -24,7 +24,7 @@ from coordinator.export import exported_run
 from coordinator.export.exported_run import exported, read_exported
 from coordinator.export.frames import instants_frame
 from coordinator.export.instants import at_instants
-from coordinator.export.ros2 import ros_name
+from coordinator.export.ros2 import Ros2Writer, ros_name
 from coordinator.main import app
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Entry
@@ -175,6 +175,23 @@ def test_nothing_is_invented_in_a_hole() -> None:
 def test_a_rate_that_cannot_be_is_refused(rate_hz: float) -> None:
     with pytest.raises(UsageError, match="instants per second"):
         at_instants({"a": constant(np.arange(3.0))}, rate_hz)
+
+
+def test_a_rate_of_which_no_instant_is_recorded_is_refused() -> None:
+    with pytest.raises(UsageError, match="the recording is too short to have one of them"):
+        at_instants({"a": constant(np.linspace(1.0, 3.0, 9))}, 0.2)
+
+
+def test_no_two_modules_share_a_topic(tmp_path: Path) -> None:
+    """Serials may differ in signs that names of topics have not."""
+    serials = ("J-1", "J.1", "J_1", "2")
+    with (tmp_path / "bag.mcap").open("wb") as file, Ros2Writer(file, {}) as writer:
+        for _ in range(2):
+            for serial in serials:
+                writer.imu(1, serial, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+    with (tmp_path / "bag.mcap").open("rb") as written:
+        topics = [channel.topic for _, channel, _ in make_reader(written).iter_messages()]
+    assert topics == 2 * ["/imu/J_1", "/imu/J_1_2", "/imu/J_1_3", "/imu/m_2"]
 
 
 # ---------------------------------------------------------------------- ROS 2

@@ -94,7 +94,12 @@ def test_unidentifiable_parameters_of_a_vertical_axis_are_named_with_the_remedy(
     offset = by_kind["offset_along_axis"]
     assert [(link.parent, link.child, link.parameters) for link in offset.links] == [(base, tip, ["z_mm"])]
     assert offset.summary.startswith(f"z of the link {base} - {tip}: offset of {tip} along {base}'s axis")
-    assert "tilting the base" in by_kind["rotation_about_axis"].summary
+    rotation = by_kind["rotation_about_axis"]
+    assert "tilting the base" in rotation.summary
+    # One rotation shows in several parameters, whose other combinations are known.
+    (link,) = rotation.links
+    names = ", ".join(name.split("_")[0] for name in link.parameters)
+    assert rotation.summary.startswith(f"{names} of the link {base} - {tip} (1 combination of them): ")
     assert result.transforms[0].sigma[2] is None
     assert score(out).unidentifiable == [item.summary for item in result.unresolved]
 

@@ -168,6 +168,10 @@ def test_with_an_encoder_a_shaking_base_is_subtracted() -> None:
 
 def test_unsuitable_data_is_refused() -> None:
     seen = read(truth(0), 0, turning=0.5)
+    with pytest.raises(ValueError, match="both gyro and accelerometer are needed"):
+        link_from_joint(seen.t_s, seen.q_rad, seen.gyro[1], seen.accel[1], seen.gyro[0])
+    with pytest.raises(DataError):
+        link_from_joint(seen.t_s[:20], seen.q_rad[:20], seen.gyro[1, :20], seen.accel[1, :20])
     short = Readings(seen.t_s[:90], seen.gyro[:, :90], seen.accel[:, :90], seen.q_rad[:90])
     with pytest.raises(DataError, match="90 samples at 250 Hz"):
         fit(short)

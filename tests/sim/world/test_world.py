@@ -69,7 +69,7 @@ def test_the_imu_rate_can_be_chosen() -> None:
 
 @pytest.mark.parametrize("rate_hz", [0.0, 300.0, 2000.0, math.nan, math.inf])
 def test_an_imu_rate_that_misses_the_ticks_is_refused(rate_hz: float) -> None:
-    with pytest.raises(UsageError, match="must be 1000 Hz by a whole number"):
+    with pytest.raises(UsageError, match="must be 1000 Hz divided by a whole number"):
         World(load_robot(IDEAL_ARM), seed=1, imu_rate_hz=rate_hz)
 
 
