@@ -348,7 +348,7 @@ class Session:
     async def _rearm(self) -> None:
         """Take the modules again and go home, without those that refuse or cannot."""
         while True:
-            # An excluded module that has let go of its joint interrupts no other one.
+            # An excluded module that no longer holds its joint interrupts no other one.
             for serial in self._excluded.look_again():
                 self.group.forget_lease(serial)
             try:

@@ -383,5 +383,5 @@ def test_the_command_says_what_it_needs(tmp_path: Path) -> None:
     alone = CliRunner().invoke(app, ["merge", str(tmp_path), "--out", str(tmp_path / "x")])
     assert alone.exit_code == 2
     empty = CliRunner().invoke(app, ["merge", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "x")])
-    assert empty.exit_code == 1
+    assert empty.exit_code == 2
     assert not (tmp_path / "x").exists()
