@@ -217,7 +217,7 @@ class FollowSession:
             while not stream.done():
                 self._group.check()
                 filling = asyncio.create_task(self._fill())
-                # A module that does not answer must not delay the stop of a robot whose guard has ended the stream.
+                # A module that does not answer must not delay the stop, if the guard has ended the stream.
                 await asyncio.wait((stream, filling), return_when=asyncio.FIRST_COMPLETED)
                 if filling.done():
                     filling.result()
