@@ -1,5 +1,6 @@
 """Identification of a payload by one short motion of all joints against the baseline, and `payload.json`."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.parameter_fit.payload import Payload, find_payload
 from coordinator.parameter_fit.report_parts import Part, Triple, triple
+from coordinator.parameter_fit.torque_sensor_scale import SCALE_SIGMA
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, dynamic_motion
 from module_agent.model.chain import Chain
@@ -88,10 +90,18 @@ def search_payload(baseline: BaselineRobot, later: BaselineRobot) -> PayloadRepo
         information = _information(chain, before)
         sigma = solve_weighted(information, INDEPENDENT_FRACTION).torque_sigma_nm
         further, places = _information(chain, moved), places_on_axes(chain)
-        found, taken_off = find_payload(information, further, places, sigma, INDEPENDENT_FRACTION), False
+        search = partial(
+            find_payload,
+            places_m=places,
+            sigma_nm=sigma,
+            independent_fraction=INDEPENDENT_FRACTION,
+            scale_sigma=SCALE_SIGMA[baseline.recording.torque],
+        )
+        found = search(information, further)
+        taken_off = False
         if not found.explains:
             # The reverse: with payload in the baseline, and without it later.
-            lost = find_payload(further, information, places, sigma, INDEPENDENT_FRACTION)
+            lost = search(further, information)
             found, taken_off = (lost, True) if lost.found else (found, False)
     except DataError as error:
         raise PayloadError(f"{later.folder} cannot be compared with {baseline.folder}: {error}") from error

@@ -11,7 +11,7 @@ S_b the columns of the body b that carries it. The robot's parameters are free w
 motions, so that the payload's covariance contains their uncertainty. The payload is physically consistent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_scale, pseudo_inertia
 from coordinator.parameter_fit.base_parameters import whitened
 from coordinator.parameter_fit.physically_consistent import Solution, physically_consistent
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
+from coordinator.parameter_fit.systematic_errors import decorrelation
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
@@ -100,6 +101,7 @@ def find_payload(
     sigma_nm: ArrayLike,
     independent_fraction: float = 1.0,
     carriers: Sequence[int] | None = None,
+    scale_sigma: float = 0.0,
 ) -> Payload:
     """Identify the payload that was added to one body of a robot between two motions.
 
@@ -110,6 +112,8 @@ def find_payload(
         sigma_nm: (n,) noise of the torques, including model errors.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         carriers: the bodies that may carry it; all when None.
+        scale_sigma: standard deviation of the torque sensors' relative scales, which are the same before and
+            later. What such an error can imitate counts no more than it is likely.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -127,11 +131,18 @@ def find_payload(
     if not len(candidates):
         raise DataError("no body may carry the payload")
     change = change_between(known, known_target, rows, target, parameter_scale(len(before)))
-    none = change.target
-    fits: dict[int, tuple[Solution, float]] = {}
-    for b in candidates:
-        added = change.along(rows[:, PER_BODY * b : PER_BODY * (b + 1)])
-        fits[b] = consistent_payload(added, none, likely[b])
+    columns = {b: rows[:, PER_BODY * b : PER_BODY * (b + 1)] for b in candidates}
+    if scale_sigma > 0.0:
+        joints = [np.repeat(np.arange(len(part)), [len(one.z) for one in part]) for part in (before, later)]
+        change = _with_scale_errors(
+            change,
+            np.concatenate([known_target, target]),
+            np.concatenate(joints),
+            scale_sigma,
+            columns,
+            likely,
+        )
+    none, fits = change.target, _fits(change, columns, likely)
     gains = {b: float(none @ none) - misfit for b, (_, misfit) in fits.items()}
     best = max(gains, key=lambda b: gains[b])
     rival = max((b for b in gains if b != best), key=lambda b: gains[b], default=None)
@@ -153,11 +164,12 @@ def find_payload(
 class Change(NamedTuple):
     """What two sets of whitened rows say that no parameters common to both explain.
 
-    target: (j,) whitened, zero but for noise if nothing has changed. later: (k', j) orthonormal directions of
-    it, of the later rows.
+    target: (j,) whitened, zero but for noise if nothing has changed. directions: (k + k', j) of it, of the
+    earlier and the later rows; later: (k', j), those of the later rows.
     """
 
     target: Array
+    directions: Array
     later: Array
 
     def along(self, columns: ArrayLike) -> Array:
@@ -174,7 +186,44 @@ def change_between(known: Array, known_target: Array, rows: Array, target: Array
     """
     left, values, _ = np.linalg.svd(np.vstack([known, rows]) * scale)
     beyond = left[:, int((values > RANK_TOLERANCE * values[0]).sum()) :]
-    return Change(beyond.T @ np.concatenate([known_target, target]), beyond[len(known) :])
+    return Change(beyond.T @ np.concatenate([known_target, target]), beyond, beyond[len(known) :])
+
+
+def _fits(change: Change, columns: Mapping[int, Array], likely: Array) -> dict[int, tuple[Solution, float]]:
+    """Return the payload on each body, and the misfit with it."""
+    return {b: consistent_payload(change.along(own), change.target, likely[b]) for b, own in columns.items()}
+
+
+def _with_scale_errors(
+    change: Change,
+    target: Array,
+    joints: Array,
+    scale_sigma: float,
+    columns: Mapping[int, Array],
+    likely: Array,
+) -> Change:
+    """Return a change as it counts where the joints' readings have errors of scale.
+
+    An error of scale is relative to the torque that the model predicts with the payload. Relative to the
+    measured one, small readings would count as surer than large ones, and the mass come out too small
+    (Peelle's pertinent puzzle; D'Agostini 1994). The prediction is that of a fit with the measured ones.
+
+    Args:
+        target: (k + k',) whitened, of all rows. joints: (k + k',) the joint that each is of.
+        columns: (k', 10) of a payload on each body that may carry it. likely: (n, 3) its centre on each.
+    """
+    first = _decorrelated(change, target, joints, scale_sigma)
+    fits = _fits(first, columns, likely)
+    best = min(fits, key=lambda b: fits[b][1])
+    left = change.target - change.along(columns[best]) @ fits[best][0].x
+    return _decorrelated(change, target - change.directions @ left, joints, scale_sigma)
+
+
+def _decorrelated(change: Change, torque: Array, joints: Array, scale_sigma: float) -> Change:
+    """Return a change as it counts with independent errors of the joints' scales, relative to `torque`."""
+    by_joint = np.where(joints[:, None] == np.unique(joints), torque[:, None], 0.0)
+    weight = decorrelation(scale_sigma * (change.directions.T @ by_joint))
+    return Change(weight @ change.target, change.directions @ weight, change.later @ weight)
 
 
 def consistent_payload(
