@@ -88,7 +88,7 @@ def test_the_arm_stays_above_a_floor_that_is_given(tmp_path: Path) -> None:
         (("--harmonics", "1"), 2, "harmonics 1: at least 2 are needed"),
         (("--rate", "10", "--harmonics", "30"), 2, "rate 10 Hz: sines of 3 Hz need at least 4 times theirs"),
         (("--out", "/nowhere/motion.csv"), 2, "/nowhere/motion.csv: there is no folder /nowhere"),
-        (("--urdf", "nowhere.urdf"), 1, "nowhere.urdf: No such file"),
+        (("--urdf", "nowhere.urdf"), 2, "nowhere.urdf: No such file"),
     ],
 )
 def test_wrong_options_are_answered_with_what_is_right(
