@@ -9,7 +9,7 @@ import typer
 
 from coordinator.commands.options import ConnectOptions, Expect, JsonFile, Speed
 from coordinator.live_robot.connection import Connection, Place, new_sender, open_connection
-from coordinator.live_robot.discovery import AS_HUB_S, Search, described, light_led
+from coordinator.live_robot.discovery import AS_HUB_S, IS_IT_THERE, Search, described, light_led
 from coordinator.live_robot.short_session import ShortSession
 from coordinator.monitoring.module_states import full_name
 from coordinator.runtime.command_line import in_a_folder, with_options
@@ -172,7 +172,7 @@ def _modules(at: ConnectOptions, expect: int | None, wanted: list[str] | None) -
         raise RobotError(f"no description from {', '.join(silent)}")
     known = {info.serial: info for info in infos}
     if not known:
-        raise RobotError(f"no module of robot {place.robot!r} answers")
+        raise RobotError(f"no module of robot {place.robot!r} answers{IS_IT_THERE}")
     if missing := [serial for serial in wanted or () if serial not in known]:
         raise RobotError(f"no module {', '.join(missing)}; there are {', '.join(known)}")
     if expect is not None and len(known) < expect:

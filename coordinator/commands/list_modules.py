@@ -6,7 +6,7 @@ from rich.table import Table
 
 from coordinator.commands.options import ConnectOptions, Expect, JsonFile
 from coordinator.live_robot.connection import Place, new_sender, open_connection
-from coordinator.live_robot.discovery import AS_HUB_S, Listing, Search, listed, stop_robot
+from coordinator.live_robot.discovery import AS_HUB_S, IS_IT_THERE, Listing, Search, listed, stop_robot
 from coordinator.monitoring.module_states import full_name
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal, figure, new_table, print_table, write_result
@@ -27,7 +27,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, json_file: JsonFile 
     found = listed(transport, place.robot, search)
     delays = {one.serial: one for one in feedback_delays(found.recording)}
     rows = [_fields(status, found, delays.get(status.serial)) for status in found.statuses]
-    if write_result(json_file, rows):
+    if write_result(json_file, rows) and rows:
         print_table(_table(place.robot, found, delays))
         if found.cpu_us_per_message is not None:
             Terminal(at.quiet).note(
@@ -101,6 +101,6 @@ def _check(robot: str, answering: int, expect: int | None, answer: str, silent: 
     if silent:
         raise RobotError(f"no {answer} from {', '.join(silent)}")
     if not answering:
-        raise RobotError(f"no module of robot {robot!r} answers")
+        raise RobotError(f"no module of robot {robot!r} answers{IS_IT_THERE}")
     if expect is not None and answering < expect:
         raise RobotError(f"{answering} modules of robot {robot!r} answer, {expect} are expected")

@@ -67,7 +67,10 @@ class ConnectOptions:
     """Where a robot is found on the network, and through which injected network."""
 
     robot: Annotated[
-        str | None, typer.Option(help="Name of the robot, part of every key [the baseline's, else robot].")
+        str | None,
+        typer.Option(
+            help="Name of the robot, part of every key [that of the run that is given, else robot]."
+        ),
     ] = None
     listen: Annotated[str, typer.Option(help="Zenoh endpoint to listen on, the hub of the agents.")] = (
         DEFAULT_ENDPOINT

@@ -26,6 +26,10 @@ Request = Callable[[str], Message]
 M = TypeVar("M", bound=Message)
 
 
+# Ends the sentence that a robot is not there.
+IS_IT_THERE = ": is that its name (--robot), do its agents run, and do they connect here?"
+
+
 class Search(NamedTuple):
     """How long to wait for modules: until none has come or left for `quiet_s`, at least `min_s`.
 

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 
 from coordinator.live_robot import link_check
-from coordinator.live_robot.discovery import MAX_S, Search, await_modules
+from coordinator.live_robot.discovery import IS_IT_THERE, MAX_S, Search, await_modules
 from coordinator.live_robot.excluded_modules import FEEDBACK_WAIT_S
 from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
@@ -94,7 +94,10 @@ class ShortSession:
         if not present or not set(serials) <= present or len(present) < (search.expect or 0):
             there = ", ".join(sorted(present)) or "none"
             wanted = f", {search.expect} are expected" if search.expect else ""
-            raise RobotError(f"modules of robot {self._name!r} are missing{wanted}; there are {there}")
+            question = "" if present else IS_IT_THERE
+            raise RobotError(
+                f"modules of robot {self._name!r} are missing{wanted}; there are {there}{question}"
+            )
         await group.meet(serials or sorted(present))
         if not await group.wait(lambda: not group.without_feedback(), FEEDBACK_WAIT_S):
             silent = ", ".join(sorted(group.without_feedback()))
