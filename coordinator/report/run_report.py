@@ -54,7 +54,7 @@ def read_run(folder: Path) -> RunData:
     """Read a run from its folder.
 
     Raises:
-        UsageError: the folder holds no recording of a run, or a result that cannot be read.
+        UsageError: the folder holds no recording of a run, or a result that cannot be read or is of another.
         SessionFileError: the recording cannot be read.
     """
     session, result = folder / SESSION, folder / RESULT
@@ -65,9 +65,15 @@ def read_run(folder: Path) -> RunData:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{result} is no result of a run: {place}: {first['msg']}") from error
+        raise UsageError(f"{result} is no result of a run: {place or 'the file'}: {first['msg']}") from error
+    recording = load_recording(session)
+    if read is not None and (strangers := sorted(set(read.serials) - recording.modules.keys())):
+        raise UsageError(
+            f"{result} has modules of which {session} has nothing ({', '.join(strangers)}): they are not of "
+            f"one run; `x5-coordinator replay {folder}` makes the result anew"
+        )
     torques = read_held_out(folder / HELD_OUT) if read is not None and read.dynamics is not None else None
-    return RunData(folder.resolve().name, load_recording(session), read, torques)
+    return RunData(folder.resolve().name, recording, read, torques)
 
 
 def write_report(folder: Path, recording: Recording, result: Result | None) -> Path:

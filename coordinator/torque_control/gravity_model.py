@@ -55,7 +55,7 @@ def read_result(folder: Path) -> Result:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise BaselineError(f"{path} is no result of a run: {place}: {first['msg']}") from error
+        raise BaselineError(f"{path} is no result of a run: {place or 'the file'}: {first['msg']}") from error
 
 
 def gravity_model(folder: Path, suspect: bool = False) -> GravityModel:

@@ -26,7 +26,7 @@ from coordinator.report.plots import robot_plot, without_pauses
 from coordinator.report.result_sections import HALF_95
 from coordinator.report.run_report import MAX_BARS, read_run, run_report, step_bars
 from module_agent.model.chain import Chain
-from module_agent.model.errors import EXIT_SUSPECT
+from module_agent.model.errors import EXIT_SUSPECT, UsageError
 from sim.robot.robot_file import load_robot
 from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from tests.random_chains import random_robot
@@ -62,6 +62,19 @@ def column(table: Table, name: str, group: str = "") -> list[Any]:
 
 def test_the_run_wrote_the_report_that_its_folder_gives(folder: Path, document: Document) -> None:
     assert (folder / REPORT).read_text() == html_page(document)
+
+
+def test_a_result_of_another_run_is_refused(folder: Path, result: Result, tmp_path: Path) -> None:
+    (tmp_path / SESSION).symlink_to(folder / SESSION)
+    text = (folder / RESULT).read_text()
+    for serial in result.serials:
+        text = text.replace(f'"{serial}"', f'"{serial}-B"')
+    (tmp_path / RESULT).write_text(text)
+    with pytest.raises(UsageError, match=r"has nothing .*-B.*: they are not of one run"):
+        read_run(tmp_path)
+    (tmp_path / RESULT).write_text("{")
+    with pytest.raises(UsageError, match="is no result of a run: the file: Invalid JSON"):
+        read_run(tmp_path)
 
 
 def test_a_link_of_unknown_length_is_said_and_has_no_interval(folder: Path, result: Result) -> None:
