@@ -338,11 +338,11 @@ class LiveRobot:
 
     async def close(self) -> None:
         """Release what is held, so that its motors are off, and leave the network."""
-        if self._keeper is not None:
-            self._keeper.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._keeper
         try:
+            if self._keeper is not None:
+                self._keeper.cancel()
+                with suppress(asyncio.CancelledError):
+                    await self._keeper
             await self.group.release_all()
         finally:
             self._messenger.close()

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from xml.etree.ElementTree import (
-    Comment,
     Element,
     SubElement,
     TreeBuilder,
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.description.urdf_reader import DRAKE, UrdfRobot, joint_pose
-from coordinator.description.urdf_writer import inertial_element, origin_of
+from coordinator.description.urdf_writer import comment_of, inertial_element, origin_of
 from coordinator.dynamics.pseudo_inertia import Body
 
 
@@ -71,7 +70,7 @@ def fitted_urdf_text(
     comment = "Inertias, friction and rotors (kg m^2, behind the gear) were identified from torques."
     lacks = f" Identified, but not in this file: {', '.join(lacking)}." if lacking else ""
     held = f" Fixed, as they were held: {', '.join(fixed)}." if fixed else ""
-    root.insert(0, Comment(f" {comment}{held}{lacks} "))
+    root.insert(0, comment_of(f"{comment}{held}{lacks}"))
     return str(tostring(root, encoding="utf-8", xml_declaration=True), "utf-8")
 
 

@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
 
 import numpy as np
@@ -266,8 +267,13 @@ def comment_undetermined(parent: Element, names: Sequence[str]) -> None:
 
 
 def comment(parent: Element, text: str) -> None:
-    """Add a comment, in which XML allows no double hyphen."""
-    parent.append(Comment(f" {re.sub('-(?=-)', '- ', text)} "))
+    """Add a comment."""
+    parent.append(comment_of(text))
+
+
+def comment_of(text: str) -> Any:
+    """Return a comment, in which XML allows no double hyphen."""
+    return Comment(f" {re.sub('-(?=-)', '- ', text)} ")
 
 
 def numbers(values: ArrayLike) -> str:

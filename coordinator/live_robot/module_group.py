@@ -12,6 +12,7 @@ from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused
 from coordinator.recording.recording import ModuleRecord, Recording
 from module_agent.control.waveform import duration_s
 from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.errors import RobotError
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
@@ -268,8 +269,14 @@ class ModuleGroup:
             Refused: another sender holds it; the message names the holder and the time left.
         """
         self._running.pop(serial, None)
+        try:
+            ack = await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "acquire"))
+        except Refused as refused:
+            # One that was this sender's must not be stopped as if it still were.
+            if refused.ack.reason == Refusal.HELD.value and serial in self._tokens:
+                self._taken_by[serial] = refused.ack.detail
+            raise
         self._taken_by.pop(serial, None)
-        ack = await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "acquire"))
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
         # Its lifetime counts from the echo in the request: on a slow network little of it is left.
         self._send(self._renew(serial))
@@ -305,7 +312,9 @@ class ModuleGroup:
         for serial in in_turn[:ANSWERED]:
             self._send(ask(serial))
         for serial in in_turn[ANSWERED:]:
-            self._messenger.publish(serial, Leaf.LEASE, self._lease(serial, "renew"), self._secret)
+            # One that fails must not end those of the others, which follow for as long as the leases last.
+            with contextlib.suppress(RobotError):
+                self._messenger.publish(serial, Leaf.LEASE, self._lease(serial, "renew"), self._secret)
 
     def _send(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.create_task(work)

@@ -32,7 +32,7 @@ from zstandard import ZstdError
 
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Entry, Kind
-from module_agent.model.errors import RobotError
+from module_agent.model.errors import RobotError, UsageError
 from module_agent.wire.keys import parse
 from module_agent.wire.messages import Ack
 from module_agent.wire.topics import TOPICS
@@ -61,7 +61,7 @@ def _schema(message_type: type[BaseModel]) -> bytes:
     return json.dumps(message_type.model_json_schema()).encode()
 
 
-class SessionFileError(RobotError):
+class SessionFileError(UsageError):
     """The file is not a recording of a session; the message names it."""
 
 

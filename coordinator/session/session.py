@@ -339,21 +339,25 @@ class Session:
             except (Refused, MotionInterrupted) as error:
                 if not self._excluded.without(error):
                     raise
-                await self._rearm()
+                await self._rearm_the_rest()
 
     def _note_exclusion(self, serial: str, why: str, by_limits: bool) -> None:
         self._reporter.note(f"going on without {serial}: {why}")
         self._journal(exclusion_event(self._clock(), serial, why, by_limits))
 
     async def _rearm(self) -> None:
+        """Take the modules again and go home."""
+        # An excluded module that no longer holds its joint interrupts no other one.
+        for serial in self._excluded.look_again():
+            self.group.forget_lease(serial)
+        await self._arm()
+        await self._home()
+
+    async def _rearm_the_rest(self) -> None:
         """Take the modules again and go home, without those that refuse or cannot."""
         while True:
-            # An excluded module that no longer holds its joint interrupts no other one.
-            for serial in self._excluded.look_again():
-                self.group.forget_lease(serial)
             try:
-                await self._arm()
-                await self._home()
+                await self._rearm()
                 return
             except (Refused, MotionInterrupted) as error:
                 if not self._excluded.without(error):
@@ -511,7 +515,7 @@ class Session:
             if not self._excluded.without(error):
                 raise
             self._reporter.note("exploring joint by joint: not all joints can move at once")
-            await self._rearm()
+            await self._rearm_the_rest()
             return self._excluded.movers()
         return await self._single_joints() if self._single_joints is not None else ()
 

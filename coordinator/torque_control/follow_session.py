@@ -212,18 +212,18 @@ class FollowSession:
 
     async def _stream(self, points: _SetPoints, mode: InputMode) -> None:
         """Stream set-points at the plan's rate to their end; no feedback of that time is missing then."""
-        stream = asyncio.create_task(self._send(points, mode))
+        stream, filling = asyncio.create_task(self._send(points, mode)), asyncio.create_task(self._fill())
         try:
             while not stream.done():
                 self._group.check()
-                filling = asyncio.create_task(self._fill())
                 # A module that does not answer must not delay the stop, if the guard has ended the stream.
                 await asyncio.wait((stream, filling), return_when=asyncio.FIRST_COMPLETED)
                 if filling.done():
                     filling.result()
-                await _cancelled(filling)
+                    filling = asyncio.create_task(self._fill())
             stream.result()
         finally:
+            await _cancelled(filling)
             await _cancelled(stream)
         await self._group.close_gaps()
 

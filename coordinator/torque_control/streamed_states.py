@@ -31,6 +31,8 @@ class StreamedStates:
         self._since_ns = now_ns if self._since_ns is None else self._since_ns
         is_late = now_ns - self._since_ns > _BEGIN_NS
         for serial, state in states.items():
+            if is_late and serial not in self._began and state not in _RELEASED_STATES:
+                raise ModuleLost(serial, f"it executes no set-points: its state is {state}")
             if state in _RELEASED_STATES and (serial in self._began or is_late):
                 status = self._group.module(serial).status
                 note = status.note if status is not None and status.state == state else ""

@@ -42,6 +42,8 @@ LOST_AFTER_S = 1.0
 # A module's clock begins anew when it boots; feedback that was overtaken is younger.
 RESTARTED_NS = 1_000_000_000
 _CONFIRM_MS, _CONFIRM_TRIES = 50, 3
+# Of the gains to brake with, which are sent until they are confirmed, while other modules have their ticks.
+_BRAKE_CONFIRM_MS, _BRAKE_AGAIN_TICKS = 5, 10
 _OFF_LED, _ON_LED = (0, 0, 0, 0), (255, 0, 255, 255)
 
 # HEBI's name of every reading of a sample from the position on, but for the two vectors.
@@ -167,8 +169,11 @@ class HebiModules:
         due = [index for index, command in enumerate(commands) if self._take(index, command)]
         active = bool(np.isfinite(self._targets).any())
         self._off_ticks = 0 if active else self._off_ticks + 1
-        if due:
-            self._send_gains(due)
+        brakes = [index for index in due if commands[index].brake]
+        if due != brakes:
+            self._send_gains([index for index in due if index not in brakes])
+        if brakes:
+            self._try_brake_gains(brakes)
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
         if active or self._may_follow:
             self._send_targets()
@@ -272,15 +277,35 @@ class HebiModules:
         if not link.follows and link.given is None:
             return False
         link.wanted = link.brake_gains if command.brake else self._information[index].gains
-        return link.wanted is not link.given
+        is_due = link.wanted is not link.given
+        return is_due and not (command.brake and self._ticks < link.brake_tick)
 
     def _send_gains(self, indices: Sequence[int]) -> None:
-        command, links = self._settings(), [self._links[index] for index in indices]
-        for index, link in zip(indices, links, strict=True):
-            write_gains(command[index], link.wanted)
-        self._confirmed(command, f"the gains of {', '.join(link.serial for link in links)}")
-        for link in links:
-            link.given = link.wanted
+        names = ", ".join(self._links[index].serial for index in indices)
+        self._confirmed(self._with_gains(indices), f"the gains of {names}")
+        for index in indices:
+            self._links[index].given = self._links[index].wanted
+
+    def _try_brake_gains(self, indices: Sequence[int]) -> None:
+        """Send the gains to brake with once, and again after a while if they are not confirmed.
+
+        A stop must end no agent, whose motors would be off then, nor wait for an answer that is lost: the
+        brake's target is sent in every tick, under whatever gains there are.
+        """
+        is_confirmed = self._group.send_command_with_acknowledgement(
+            self._with_gains(indices), timeout_ms=_BRAKE_CONFIRM_MS
+        )
+        for index in indices:
+            link = self._links[index]
+            link.given = link.wanted if is_confirmed else None
+            link.brake_tick = self._ticks + _BRAKE_AGAIN_TICKS
+
+    def _with_gains(self, indices: Sequence[int]) -> Any:
+        """Return a command with the targets of the last one, and the gains that modules are to have."""
+        command = self._settings()
+        for index in indices:
+            write_gains(command[index], self._links[index].wanted)
+        return command
 
     @property
     def _lent(self) -> list[int]:
@@ -335,7 +360,7 @@ class _Link:
     stays_off: it holds its motor off by itself, at its M-stop or at a limit. is_withheld: it is sent neither
     targets nor gains until it is to follow a target. m_stop_latches: the M-stop leaves its motor off.
     follows: its last target was one. given: the gains that were written last, None where another program may
-    have written others since; wanted: those that are to be.
+    have written others since; wanted: those that are to be. brake_tick: when those to brake with are due.
     """
 
     def __init__(self, information: ModuleInformation):
@@ -350,6 +375,7 @@ class _Link:
         self.follows = False
         self.given: GainSet | None = None
         self.wanted = information.gains
+        self.brake_tick = 0
         self.brake_gains = default_gains(module_type(information.module_type), DEFAULT_STRATEGY)
         self._check = SampleCheck(module_type(information.module_type))
         self._sequence = 0

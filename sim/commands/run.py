@@ -23,6 +23,7 @@ from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import score_run
 from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError, default_processes
 from sim.robot.robot_file import RobotFileError
+from sim.scoring.score import ScoreError
 from sim.scoring.truth_recording import add_truth
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
@@ -81,7 +82,7 @@ def run(
         safety=launched.limits_of(robot),
     )
     suspicions = _run_virtual(config, quiet)
-    score_run(config.out)
+    _score(config.out)
     _print_report(config.out)
     end_if_suspect(suspicions)
 
@@ -145,7 +146,7 @@ def _launch(
     with live_page(viewer, serve_port) as stay:
         code = _run_processes(config)
         add_truth(config.out, reachable, _note)
-        score_run(config.out)
+        _score(config.out)
         _print_report(config.out)
         stay()
     if code:
@@ -179,6 +180,14 @@ def _run_virtual(config: VirtualConfig, quiet: bool) -> list[str]:
         f"{result.robot_time_s:.1f} s of robot time in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x"
     )
     return result.suspicions
+
+
+def _score(out: Path) -> None:
+    """Score a run that has just ended; what is wrong with it then is no wrong usage."""
+    try:
+        score_run(out)
+    except ScoreError as error:
+        fail(str(error), EXIT_FAILED)
 
 
 def _print_report(out: Path) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from coordinator.excitation.plan import Plan
@@ -244,6 +245,24 @@ def test_a_pause_of_the_network_is_survived_though_a_joint_has_been_excluded(arm
     assert missing.startswith(
         "elbow took no part: it did not hold its joint to the end: its state is expired"
     )
+
+
+def test_a_motor_that_protects_itself_while_it_is_explored_is_left_out(arm: Any) -> None:
+    """Taking it again is refused: nothing else of the robot is lost by that."""
+
+    def heat(text: str) -> None:
+        if text == "exploring joint lift":
+            above_k = np.zeros((3, 4))
+            above_k[:, arm.serials.index("lift")] = 150.0
+            arm.at(arm.loop.time() + 1.0, lambda: arm.world.warm(above_k))
+
+    recording, watcher = explore(arm, on_step=heat)
+    assert any(note.startswith("going on without lift") for note in watcher.notes)
+    assert {e.step for e in recording.journal if e.what == "done"} >= {
+        "explore/elbow",
+        "explore/wrist",
+        "back",
+    }
 
 
 def test_two_joints_that_may_not_go_home_are_left_out(arm: Any) -> None:

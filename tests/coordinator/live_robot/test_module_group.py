@@ -12,6 +12,7 @@ from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused, gathe
 from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
 from module_agent.control.motion import effort_profile
 from module_agent.network_emulation.profile import NetworkProfile
+from module_agent.transport.transport import TransportError
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest, Setpoint
 
@@ -294,6 +295,55 @@ def test_a_module_whose_lease_was_taken_once_can_be_held_again(rigs: Callable[..
         await first.run({BASE: Rest(duration_s=0.3)})
         assert await first.stop_all("for the test") == []
         assert rig.state(BASE) == "stopped"
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_a_module_that_another_holds_now_is_not_stopped_with_the_others(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, _, first = rig.group("first")
+    _, _, second = rig.group("second")
+
+    async def work() -> None:
+        await _met(first)
+        await _met(second)
+        for serial in (BASE, TIP):
+            await first.acquire(serial)
+        await asyncio.sleep(1.1)
+        await second.acquire(BASE)
+        keeper = asyncio.create_task(second.keep_alive())
+        with pytest.raises(Refused, match="held by second"):
+            await first.acquire(BASE)
+        assert await first.stop_all("for the test") == []
+        assert [rig.state(serial) for serial in (BASE, TIP)] == ["armed", "stopped"]
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_one_renewal_that_cannot_be_sent_does_not_end_those_of_the_others(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(MANY)
+    messenger, _, group = rig.group()
+    publish, failed = messenger.publish, []
+
+    def failing(serial: str, leaf: Leaf, *rest: Any) -> None:
+        if not failed:
+            failed.append(serial)
+            raise TransportError("for the test")
+        publish(serial, leaf, *rest)
+
+    monkeypatch.setattr(messenger, "publish", failing)
+
+    async def work() -> None:
+        keeper = asyncio.create_task(group.keep_alive())
+        await _met(group, *rig.serials)
+        await gather_all(group.acquire(serial) for serial in rig.serials)
+        await asyncio.sleep(1.0)
+        assert failed
+        assert {rig.state(serial) for serial in rig.serials} == {"armed"}
         keeper.cancel()
 
     rig.run(work())

@@ -306,6 +306,29 @@ def test_a_stop_brakes_under_the_factorys_gains_whatever_the_holders_gains_do(le
     assert leased.module.gains.velocity.min_output == pytest.approx(0.3)
 
 
+def test_a_stop_brakes_at_once_though_no_gains_are_confirmed(
+    leased: Leased, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent that ended of it would leave all of its motors off."""
+    assert leased.acquire().accepted
+    leased.run(20)
+    with monkeypatch.context() as patch:
+        tried: list[int] = []
+        patch.setattr(
+            Group, "send_command_with_acknowledgement", lambda *_, timeout_ms, **__: tried.append(timeout_ms)
+        )
+        assert leased.ask(Leaf.STOP, Stop, why="for the test").accepted
+        leased.run(50)
+        assert leased.firmware.state == "stopped"
+        # Tried again and again, and never waited for.
+        assert 4 <= len(tried) <= 7
+        assert max(tried) <= 5
+        velocity = leased.driver._targets[LAST, 1]
+        assert velocity == 0.0
+    leased.run(12)
+    assert leased.driver._links[LAST].given is leased.driver._links[LAST].brake_gains
+
+
 def test_the_next_agent_and_other_programs_find_the_gains_that_the_module_came_with(leased: Leased) -> None:
     own = default_gains(leased.module._kind, 4)
     leased.module._loops.set_gains(0, own)
