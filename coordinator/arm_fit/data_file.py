@@ -35,6 +35,8 @@ _JITTER = 0.02
 # not reach, they are bridged; at longer ones the recording is split.
 _GAP, _BRIDGED_S = 5.0, 0.010
 _MAX_REPEATED = 3
+# Of a joint that is taken as fixed [rad, m]: a gripper's fingers move by centimetres, and weigh little.
+_TRAVEL = 0.05
 # Share of positions that stay while another joint moves: the encoder's resolution shows.
 _COARSE = 0.3
 
@@ -228,8 +230,10 @@ def _read_csv(path: Path, joints: Sequence[str], gains: Mapping[str, float], hel
     count = len(joints)
     signals = {key: values[:, 1 + count * i : 1 + count * (i + 1)] for i, key in enumerate(list(names)[1:])}
     signals["tau"] = signals["tau"] * [gains.get(joint, 1.0) for joint in joints]
-    others = values[:, values.shape[1] - len(at) :].mean(axis=0) if len(values) else np.zeros(len(at))
-    means = dict(zip(at, others.tolist(), strict=True))
+    others = values[:, values.shape[1] - len(at) :]
+    means = {
+        joint: _place_of(joint, own) if len(own) else 0.0 for joint, own in zip(at, others.T, strict=True)
+    }
     return _Table(values[:, 0], signals, lambda row: f"line {lines[row]}", means)
 
 
@@ -304,7 +308,7 @@ def _read_npz(path: Path, joints: Sequence[str], gains: Mapping[str, float], hel
         signals["tau"] = np.where(np.isnan(factors), signals.get("tau", current), factors * current)
     if "velocity_rad_s" in arrays:
         signals["qd"] = _array(arrays, "velocity_rad_s", names, len(position))[:, order]
-    means = {n: float(position[:, i].mean()) for i, n in enumerate(names) if n in held and len(position)}
+    means = {n: _place_of(n, position[:, i]) for i, n in enumerate(names) if n in held and len(position)}
     return _Table(_npz_times(arrays, len(position)), signals, lambda row: f"row {row}", means)
 
 
@@ -377,8 +381,20 @@ def _read_mcap(path: Path, joints: Sequence[str], gains: Mapping[str, float], he
                 f"message {row}, {key} of {joints[column]}: {values[row, column]}; a finite number is needed"
             )
     positions = {joint: [s.position[joint] for s in states if joint in s.position] for joint in held}
-    means = {joint: float(np.mean(values)) for joint, values in positions.items() if values}
+    means = {joint: _place_of(joint, np.array(own)) for joint, own in positions.items() if own}
     return _Table(np.array([s.t_s for s in whole]), signals, lambda row: f"message {row}", means)
+
+
+def _place_of(joint: str, position: Array) -> float:
+    """Return the mean position [rad, m] of a joint that slides or mimics, and so is taken as fixed."""
+    travel = float(np.ptp(position))
+    if travel > _TRAVEL:
+        _refuse(
+            f"joint {joint!r} moves by {travel:.3g} (rad or m), and is taken as fixed, since it slides or "
+            "mimics: what it carries would count wrongly; record it at rest, or leave its column out, which "
+            "takes it at 0"
+        )
+    return float(position.mean())
 
 
 # ---------------------------------------------------------------------- times

@@ -98,6 +98,22 @@ def test_a_gripper_is_fixed_where_it_was_recorded(recording: Any, tmp_path: Path
     np.testing.assert_array_equal(found.log.tau_nm, recording.tau_nm)
 
 
+def test_a_rail_that_moves_is_not_taken_as_fixed(recording: Any, tmp_path: Path) -> None:
+    """It slides, and so has no place in the model: its motion would count as something else."""
+    path = tmp_path / "rail.urdf"
+    path.write_text(recording.urdf.read_text().replace("</robot>", FINGER))
+    swing = 0.6 * np.sin(3.0 * np.arange(len(recording.q_rad)) / RATE_HZ)
+    np.savez(
+        tmp_path / "log.npz",
+        sample_rate_hz=RATE_HZ,
+        joint_names=np.array(["grip", *JOINTS]),
+        position_rad=np.column_stack([swing, recording.q_rad]),
+        torque=np.column_stack([np.zeros(len(recording.q_rad)), recording.tau_nm]),
+    )
+    with pytest.raises(UsageError, match=r"joint 'grip' moves by 1\.2 \(rad or m\), and is taken as fixed"):
+        read_recordings(read_urdf(path), [tmp_path / "log.npz"], {}, checked=True)
+
+
 def test_currents_become_torques_by_their_constants(recording: Any, tmp_path: Path) -> None:
     gains = {"elbow": 8.5, "waist": -12.0}
     current = recording.tau_nm / [gains["waist"], gains["elbow"], 1.0]
