@@ -1,5 +1,6 @@
 """Commands are imported on demand, options are expanded from classes, and errors become exit codes."""
 
+import errno
 import os
 import re
 import shlex
@@ -46,6 +47,8 @@ def count(settings: Options, loud: bool = False) -> None:
         raise KeyboardInterrupt
     if settings.subject == "file":
         Path("/no/such/file").read_text()
+    if settings.subject == "disk":
+        raise OSError(errno.ENOSPC, "No space left on device", "session.mcap")
     typer.echo(f"{settings.count} {settings.subject} {loud}")
 
 
@@ -108,7 +111,9 @@ def test_options_are_expanded_from_their_class() -> None:
     assert CliRunner().invoke(APP, ["count"]).exit_code == 2
 
 
-@pytest.mark.parametrize(("subject", "code"), [("lost", 3), ("failed", 130), ("signal", 130), ("file", 1)])
+@pytest.mark.parametrize(
+    ("subject", "code"), [("lost", 3), ("failed", 130), ("signal", 130), ("file", 2), ("disk", 1)]
+)
 def test_an_error_of_the_domain_is_printed_and_ends_with_its_exit_code(subject: str, code: int) -> None:
     done = CliRunner().invoke(APP, ["count", subject])
     assert done.exit_code == code
