@@ -13,7 +13,7 @@ differences, and its covariance is J C J^T.
 import asyncio
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -31,7 +31,7 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
 from coordinator.live_robot.connection import Place, new_sender, open_connection
 from coordinator.live_robot.discovery import await_modules
-from coordinator.live_robot.messenger import Messenger, Record, gather_all
+from coordinator.live_robot.messenger import Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, SESSION
@@ -294,7 +294,6 @@ class LiveRobot:
         self.group = group
         self.recording = recording
         self._messenger = messenger
-        self._keeper: asyncio.Task[None] | None = None
 
     @property
     def serials(self) -> tuple[str, ...]:
@@ -321,10 +320,7 @@ class LiveRobot:
         Raises:
             Refused: another program holds one; the message names it and the time left. The others are held.
         """
-        # The keep-alives first: a lease must not expire while the next module is slow to answer.
-        if self._keeper is None:
-            self._keeper = asyncio.create_task(self.group.keep_alive())
-        await gather_all(self.group.acquire(serial) for serial in serials or self.serials)
+        await self.group.acquire(*(serials or ()))
 
     async def move_to(self, position_rad: Mapping[str, float], max_speed_rad_s: float = 0.5) -> None:
         """Move joints of held modules to positions, all at the same time, by minimum jerk.
@@ -339,10 +335,6 @@ class LiveRobot:
     async def close(self) -> None:
         """Release what is held, so that its motors are off, and leave the network."""
         try:
-            if self._keeper is not None:
-                self._keeper.cancel()
-                with suppress(asyncio.CancelledError):
-                    await self._keeper
             await self.group.release_all()
         finally:
             self._messenger.close()

@@ -2,10 +2,12 @@
 
 import itertools
 from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import pytest
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
@@ -170,3 +172,11 @@ class Rig(VirtualRobot):
         super().close()
         if not self._guest:
             self.loop.close()
+
+
+@contextmanager
+def silent(group: ModuleGroup) -> Iterator[None]:
+    """Renew no lease meanwhile, as a program that hangs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(group.commander, "renew", lambda **_how: None)
+        yield

@@ -1,18 +1,17 @@
-"""All modules of one robot under one sender's leases: keep-alives, motions, complete recordings."""
+"""All modules of one robot under one sender's leases: presence, motions, complete recordings."""
 
 import asyncio
-import contextlib
-from collections.abc import Awaitable, Callable, Container, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from coordinator.live_robot.backfill import RowCompletion
+from coordinator.live_robot.commander import ATTEMPTS, POLL_S, SILENT_NS, Commander
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused, Sender, gather_all
 from coordinator.recording.recording import ModuleRecord, Recording
 from module_agent.control.waveform import duration_s
 from module_agent.model.catalogue import ModuleType, module_type
-from module_agent.model.errors import RobotError
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
@@ -24,7 +23,6 @@ from module_agent.wire.messages import (
     GainSet,
     HistoryRequest,
     Info,
-    LeaseRequest,
     Message,
     MotionCommand,
     MotionRecord,
@@ -34,22 +32,7 @@ from module_agent.wire.messages import (
 )
 from module_agent.wire.refusal import Refusal
 
-POLL_S = 0.02
-# Four keep-alives within the default lifetime of 250 ms.
-KEEP_ALIVE_S = 0.06
-# So many modules are asked to answer each keep-alive: a lost lease shows at once, and the answer is a round
-# trip for the module's clock. Question and answer cost five times what a publication does, so that of more
-# modules these are asked in turn, and all others are told.
-ANSWERED = 8
-# A renewal that takes longer, or is lost, marks the network as poor for a while.
-LATE_NS = 100_000_000
-POOR_NS = 10_000_000_000
-LEASE_NS = 1_000_000_000
-ATTEMPTS = 8
-SILENT_NS = 1_000_000_000
 TOKEN_GONE_NS = 300_000_000
-# Refusals that the next attempt can resolve: it carries a newer echo and a newer sequence number.
-PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
 # Refusals of a motion that re-arming resolves. If every attempt is refused by SEQUENCE, the motion has ended
 # already: it had begun, and the answer and the keep-alives were lost.
 UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
@@ -57,7 +40,6 @@ UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.v
 Gate = Callable[[Mapping[str, Pattern], Mapping[str, float]], None]
 """Raises `MotionForbidden` against motions that modules are to begin together from positions [rad] of all."""
 
-T = TypeVar("T")
 M = TypeVar("M", bound=Message)
 
 
@@ -85,21 +67,13 @@ class ModuleGroup:
     ):
         self._gate = gate
         self.serials: tuple[str, ...] = ()
-        self.sender, self._secret = sender
+        self.commander = Commander(messenger, recording, clock, sender, self.check)
         self._messenger = messenger
         self._recording = recording
         self._clock = clock
-        self._tokens: dict[str, int] = {}
-        self._boots: dict[str, int] = {}
-        self._armed_ns: dict[str, int] = {}
         self._rows: dict[str, RowCompletion] = {}
         self._last_id = 0
-        self._renewals: set[asyncio.Task[None]] = set()
-        self._turn = 0
-        self._taken_by: dict[str, str] = {}
-        self._running: dict[str, _Started] = {}
         self._streams: set[str] = set()
-        self._poor_until_ns = 0
 
     # ------------------------------------------------------------------ presence and state
 
@@ -128,7 +102,7 @@ class ModuleGroup:
         """Request every module's description, and note its boot."""
         for serial in serials:
             info = await self._ask(serial, Leaf.INFO, Info)
-            self._boots[serial] = info.boot
+            self.commander.boots[serial] = info.boot
             log = self.module(serial).rows
             self._rows[serial] = RowCompletion(log, partial(self._fetch, serial))
         self.serials = tuple(serials)
@@ -148,60 +122,14 @@ class ModuleGroup:
         return await self._ask(serial, Leaf.STATUS, Status)
 
     async def _ask(self, serial: str, leaf: Leaf, expected: type[M]) -> M:
-        answer = await self._persist(
-            serial, lambda: self._messenger.ask(serial, leaf, self._request(Ask, serial))
+        answer = await self.commander.persist(
+            serial, lambda: self._messenger.ask(serial, leaf, self.commander.request(Ask, serial))
         )
         if isinstance(answer, Ack) and not answer.accepted:
             raise NoAnswer(serial, leaf, f"it refuses: {answer.reason}: {answer.detail}")
         if not isinstance(answer, expected):
             raise NoAnswer(serial, leaf, f"its answer is {type(answer).__name__}")
         return answer
-
-    def _request(self, kind: type[M], serial: str, **fields: Any) -> M:
-        """Return a message that needs no lease, by default to whatever boot of the module is there."""
-        head = {"serial": serial, "boot": 0, "seq": self._messenger.next_seq(), "sender": self.sender}
-        return kind.model_validate(head | fields)
-
-    def _command(self, kind: type[M], serial: str, **fields: Any) -> M:
-        """Return a command under the lease; it echoes the newest module time."""
-        head = {
-            "boot": self._boots[serial],
-            "token": self._tokens.get(serial, 0),
-            "echo_ns": self.module(serial).newest_ns,
-        }
-        return self._request(kind, serial, **head, **fields)
-
-    def _lease(self, serial: str, action: str) -> LeaseRequest:
-        # No other program hears an acquisition; renewals are proven like every other command.
-        secret = self._secret if action == "acquire" else b""
-        return self._command(LeaseRequest, serial, action=action, duration_ns=LEASE_NS, secret=secret)
-
-    async def _commanded(self, serial: str, leaf: Leaf, command: Message, timeout_s: float = 0.5) -> Ack:
-        """Send a command under the lease, with the proof that it is this sender's."""
-        return await self._messenger.command(serial, leaf, command, timeout_s, self._secret)
-
-    async def _achieve(self, serial: str, leaf: Leaf, command: Callable[[], Message]) -> Ack:
-        """Send commands, each made anew, until one is acknowledged."""
-        return await self._persist(serial, lambda: self._commanded(serial, leaf, command()))
-
-    async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
-        """Try until answered; a network may lose requests and answers."""
-        for left in reversed(range(ATTEMPTS)):
-            try:
-                return await attempt()
-            except NoAnswer:
-                self.check()
-                if not left:
-                    # Of an agent that has died the network says at once that none answers, many times before
-                    # its silence shows.
-                    await self.wait(lambda: False, 1e-9 * SILENT_NS + POLL_S)
-                    raise
-            except Refused as refused:
-                if refused.ack.reason not in PASSING or not left:
-                    raise
-                # The echo is renewed by the next feedback.
-                await asyncio.sleep(POLL_S)
-        raise AssertionError("unreachable")
 
     def check(self) -> None:
         """Check that every module is still present and held.
@@ -214,15 +142,14 @@ class ModuleGroup:
         now = self._clock()
         for serial in self.serials:
             record = self.module(serial)
-            if record.boot != self._boots[serial]:
+            if record.boot != self.commander.boots[serial]:
                 raise ModuleLost(serial, "it has booted anew")
             silent_ns = 0 if record.feedback_ns is None else now - record.feedback_ns
             if serial not in self._messenger.alive and silent_ns > TOKEN_GONE_NS:
                 raise ModuleLost(serial, "its agent has left the network")
             if silent_ns > SILENT_NS:
                 raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s")
-            if serial in self._taken_by:
-                raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
+            self.commander.check_lease(serial)
             status = self.status_under_lease(serial)
             if status is not None and status.state == "stopped":
                 raise RobotStopped(serial, status.note)
@@ -231,8 +158,8 @@ class ModuleGroup:
 
     def status_under_lease(self, serial: str) -> Status | None:
         """Return the status; None before the lease, as it may report an earlier stop or expiry."""
-        status = self.module(serial).status
-        fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
+        status, armed_ns = self.module(serial).status, self.commander.armed_ns(serial)
+        fresh = status is not None and armed_ns is not None and status.t_ns > armed_ns
         return status if fresh else None
 
     async def check_now(self) -> None:
@@ -257,122 +184,38 @@ class ModuleGroup:
 
     @property
     def is_poor(self) -> bool:
-        """Whether renewals were late or lost within the last `POOR_NS`."""
-        return self._clock() < self._poor_until_ns
+        """Whether keep-alives were late or lost within the last seconds."""
+        return self.commander.is_poor
 
     # ------------------------------------------------------------------ leases
 
-    async def acquire(self, serial: str) -> None:
-        """Take the lease of a module and arm it.
+    async def acquire(self, *serials: str) -> None:
+        """Take the leases of modules, all by default, which arms them; they are renewed until given back.
 
         Raises:
-            Refused: another sender holds it; the message names the holder and the time left.
+            Refused: another sender holds one; the message names the holder and the time left. The others are
+                held.
         """
-        self._running.pop(serial, None)
-        try:
-            ack = await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "acquire"))
-        except Refused as refused:
-            # One that was this sender's must not be stopped as if it still were.
-            if refused.ack.reason == Refusal.HELD.value and serial in self._tokens:
-                self._taken_by[serial] = refused.ack.detail
-            raise
-        self._taken_by.pop(serial, None)
-        self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
-        # Its lifetime counts from the echo in the request: on a slow network little of it is left.
-        self._send(self._renew(serial))
+        await gather_all(self.commander.acquire(serial) for serial in serials or self.serials)
 
     def forget_lease(self, serial: str) -> None:
         """Renew the lease of a module no more, which lapses then, and expect nothing of it."""
-        self._tokens.pop(serial, None)
-
-    async def keep_alive(self) -> None:
-        """Renew all leases until cancelled; a late answer does not hold up the next renewal.
-
-        While renewals are late or lost, running motions of the modules that were asked are commanded again in
-        between, which renews the lease too: messages keep their order on one key, and are seldom late on two
-        keys at the same time.
-        """
-        while True:
-            self.renew()
-            await asyncio.sleep(0.5 * KEEP_ALIVE_S)
-            if self.is_poor:
-                self._renew_by(self._repeat_or_renew)
-            await asyncio.sleep(0.5 * KEEP_ALIVE_S)
-
-    def renew(self) -> None:
-        """Renew all leases once; needed every `KEEP_ALIVE_S` without `keep_alive`."""
-        self._turn += ANSWERED
-        self._renew_by(self._renew)
-
-    def _renew_by(self, ask: Callable[[str], Coroutine[None, None, None]]) -> None:
-        """Renew all leases: of the `ANSWERED` modules whose turn it is by what `ask` returns."""
-        held = list(self._tokens)
-        begin = self._turn % len(held) if len(held) > ANSWERED else 0
-        in_turn = held[begin:] + held[:begin]
-        for serial in in_turn[:ANSWERED]:
-            self._send(ask(serial))
-        for serial in in_turn[ANSWERED:]:
-            # One that fails must not end those of the others, which follow for as long as the leases last.
-            with contextlib.suppress(RobotError):
-                self._messenger.publish(serial, Leaf.LEASE, self._lease(serial, "renew"), self._secret)
-
-    def _send(self, work: Coroutine[None, None, None]) -> None:
-        task = asyncio.create_task(work)
-        self._renewals.add(task)
-        task.add_done_callback(self._renewals.discard)
-
-    async def _renew(self, serial: str) -> None:
-        sent_ns = self._clock()
-        try:
-            await self._commanded(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
-        except NoAnswer:
-            pass  # lost; the next one follows, and `check` notices missing feedback
-        except Refused as refused:
-            if refused.ack.reason == Refusal.HELD.value:
-                self._taken_by[serial] = refused.ack.detail
-        if self._clock() - sent_ns > LATE_NS:
-            self._poor_until_ns = self._clock() + POOR_NS
-
-    def _repeat_or_renew(self, serial: str) -> Coroutine[None, None, None]:
-        return (self._repeat if serial in self._running else self._renew)(serial)
-
-    async def _repeat(self, serial: str) -> None:
-        """Command a module's latest motion again; a module begins no motion twice."""
-        running = self._running.get(serial)
-        if running is None:
-            return
-        # Lost or refused: the next renewal follows.
-        with contextlib.suppress(NoAnswer, Refused):
-            await self._commanded(serial, Leaf.MOTION, self._motion(serial, running), timeout_s=0.3)
+        self.commander.forget(serial)
 
     async def release_all(self) -> None:
         """Release all modules; their motors are off then."""
-        await gather_all(self._release(serial) for serial in list(self._tokens))
-
-    async def _release(self, serial: str) -> None:
-        try:
-            await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "release"))
-        except Refused as refused:
-            # The first answer may have been lost: then there is nothing left to release.
-            if refused.ack.reason not in (Refusal.NO_LEASE.value, Refusal.HELD.value):
-                raise
-        self._tokens.pop(serial, None)
+        await self.commander.release_all()
 
     async def stop_all(self, why: str) -> list[str]:
         """Stop every module that this sender holds; return the serials that did not confirm."""
-        # Not the modules whose lease another coordinator has taken.
-        held = [serial for serial in self._tokens if serial not in self._taken_by]
-        self._tokens.clear()
-        stops = (self._messenger.stop(serial, self.sender, why) for serial in held)
-        done = await asyncio.gather(*stops, return_exceptions=True)
-        return [s for s, r in zip(held, done, strict=True) if isinstance(r, BaseException)]
+        return await self.commander.stop_all(why)
 
     # ------------------------------------------------------------------ motions
 
     async def set_gains(self, serial: str, gains: GainSet, keep: bool = False) -> None:
         """Replace a module's gains, until the end of the lease or, to `keep`, of its boot."""
-        await self._achieve(
-            serial, Leaf.GAINS, lambda: self._command(GainsCommand, serial, gains=gains, keep=keep)
+        await self.commander.achieve(
+            serial, Leaf.GAINS, lambda: self.commander.command(GainsCommand, serial, gains=gains, keep=keep)
         )
 
     def stream(
@@ -380,10 +223,10 @@ class ModuleGroup:
     ) -> None:
         """Send one set-point, which is not acknowledged; None switches a loop off."""
         # The set-point replaces the last motion, which must not be commanded again.
-        self._running.pop(serial, None)
+        self.commander.repeat_no_more(serial)
         self._streams.add(serial)
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
-        self._messenger.publish(serial, Leaf.SETPOINT, self._command(Setpoint, serial, **point), self._secret)
+        self.commander.publish(serial, Leaf.SETPOINT, self.commander.command(Setpoint, serial, **point))
 
     def _next_id(self) -> int:
         # Numbers grow from one coordinator to the next, so that none repeats.
@@ -426,7 +269,7 @@ class ModuleGroup:
         )
         if self.is_poor:
             # The status of a module that expired may itself be lost.
-            await gather_all(self.ask_status(serial) for serial in self._tokens)
+            await gather_all(self.ask_status(serial) for serial in self.commander.held)
         if (expired := self._expired(started)) is not None:
             raise MotionInterrupted(
                 next(iter(patterns)), f"interrupted: module {expired} expired and released its joint"
@@ -450,7 +293,7 @@ class ModuleGroup:
 
     def _expired(self, moved: Container[str]) -> str | None:
         """Return a held module without a motion that has expired meanwhile."""
-        for serial in self._tokens:
+        for serial in self.commander.held:
             status = self.status_under_lease(serial)
             if serial not in moved and status is not None and status.state == "expired":
                 return serial
@@ -467,13 +310,15 @@ class ModuleGroup:
 
     def _motion(self, serial: str, motion: _Started) -> MotionCommand:
         what = {"motion_id": motion.number, "pattern": motion.pattern, "effort": motion.effort}
-        return self._command(MotionCommand, serial, **what)
+        return self.commander.command(MotionCommand, serial, **what)
 
     async def _start(self, serial: str, motion: _Started) -> None:
-        self._running.pop(serial, None)
+        self.commander.repeat_no_more(serial)
+        command = partial(self._motion, serial, motion)
         try:
-            await self._achieve(serial, Leaf.MOTION, lambda: self._motion(serial, motion))
-            self._running[serial] = motion
+            await self.commander.achieve(serial, Leaf.MOTION, command)
+            # It begins no motion twice.
+            self.commander.repeat(serial, Leaf.MOTION, command)
         except Refused as refused:
             if refused.ack.reason in UNSTARTED:
                 raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused
@@ -503,15 +348,15 @@ class ModuleGroup:
 
     async def _fetch(self, serial: str, first: int, end: int) -> None:
         """Request rows until they, or a refusal, have come."""
-        what = {"boot": self._boots[serial], "first_row": first, "end_row": end}
+        what = {"boot": self.commander.boots[serial], "first_row": first, "end_row": end}
 
         async def attempt() -> None:
-            request = self._request(HistoryRequest, serial, **what)
+            request = self.commander.request(HistoryRequest, serial, **what)
             answer = await self._messenger.ask(serial, Leaf.HISTORY, request)
             if isinstance(answer, Ack):
                 raise Refused(serial, Leaf.HISTORY, answer)
 
-        await self._persist(serial, attempt)
+        await self.commander.persist(serial, attempt)
 
     async def estimate(self, observer: str, joint: str, motion_id: int, timeout_s: float) -> Estimate | None:
         """Wait for the observer's estimate of a motion, requested again if lost; None if there is none."""
@@ -525,7 +370,7 @@ class ModuleGroup:
         for _ in range(ATTEMPTS):
             try:
                 await self._messenger.ask(
-                    observer, Leaf.ESTIMATE, self._request(EstimateRequest, observer, joint=joint)
+                    observer, Leaf.ESTIMATE, self.commander.request(EstimateRequest, observer, joint=joint)
                 )
             except NoAnswer:
                 self.check()

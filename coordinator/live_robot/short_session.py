@@ -1,6 +1,5 @@
 """Short dealings with a robot's modules that move none: the network is checked, or gains are given."""
 
-import asyncio
 from collections.abc import Callable, Sequence
 
 from coordinator.live_robot import link_check
@@ -49,16 +48,13 @@ class ShortSession:
             await self._meet()
             group = self._group
             gains = chosen([group.info(serial).gains for serial in group.serials])
-            keeper = asyncio.create_task(group.keep_alive())
             try:
-                await gather_all(group.acquire(serial) for serial in group.serials)
+                await group.acquire()
                 await gather_all(
                     group.set_gains(serial, own, keep=True)
                     for serial, own in zip(group.serials, gains, strict=True)
                 )
             finally:
-                keeper.cancel()
-                await asyncio.gather(keeper, return_exceptions=True)
                 await group.release_all()
             return group.serials
         finally:

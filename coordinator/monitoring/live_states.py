@@ -38,7 +38,6 @@ class LiveStates:
         self._note = note
         self._described: set[tuple[str, int]] = set()
         self._group: ModuleGroup | None = None
-        self._keeper: asyncio.Task[None] | None = None
         self._lit: str | None = None
         self._work: set[asyncio.Task[None]] = set()
         self._holding: asyncio.Task[None] | None = None
@@ -108,12 +107,9 @@ class LiveStates:
 
     async def _hold(self) -> None:
         group = self._group = ModuleGroup(self._messenger, self._states.recording, self._clock, self._sender)
-        # The keep-alives first: a lease must not expire while the next module is slow to answer.
-        self._keeper = asyncio.create_task(group.keep_alive())
-        self._keeper.add_done_callback(self._kept)
         try:
             await group.meet(sorted(self._messenger.alive))
-            await gather_all(group.acquire(serial) for serial in group.serials)
+            await group.acquire()
         except RobotError:
             await self._release()
             raise
@@ -141,19 +137,10 @@ class LiveStates:
         head = {"serial": serial, "boot": 0, "seq": self._messenger.next_seq(), "sender": self._sender.name}
         await self._messenger.command(serial, Leaf.IDENTIFY, Identify.model_validate({**head, "on": on}))
 
-    def _kept(self, keeper: "asyncio.Task[None]") -> None:
-        """Say why holding ended, if it was not asked to."""
-        if not keeper.cancelled() and (error := keeper.exception()) is not None:
-            self._note(f"held no longer: {error}")
-
     async def _release(self) -> None:
         group, self._group = self._group, None
         if group is None:
             return
-        if self._keeper is not None:
-            self._keeper.cancel()
-            await asyncio.gather(self._keeper, return_exceptions=True)
-            self._keeper = None
         await group.release_all()
         self._note("released")
 

@@ -114,7 +114,6 @@ class Session:
         self._total = 4
         # None before the modules are known.
         self._times: ExpectedTimes | None = None
-        self._keeper: asyncio.Task[None] | None = None
         self._excluded = ExcludedModules(group, self._note_exclusion)
         # Modules that were there so far, and where the joints of those that take part stood.
         self._known = frozenset[str]()
@@ -140,8 +139,6 @@ class Session:
         self._starts = {s: self._position(s) for s in self.group.serials}
         self._times = self._expected()
         try:
-            # The keep-alives first: a lease must not expire while the next module is slow to answer.
-            self._keeper = asyncio.create_task(self.group.keep_alive())
             await self._arm()
             while True:
                 try:
@@ -378,7 +375,6 @@ class Session:
             self._note_late(late.serials)
         self._excluded.look_again()
         await self.group.release_all()
-        await self._stop_keeping()
         await self.group.close_gaps()
         self._note_late(sorted(frozenset(self._messenger.alive) - self._known))
 
@@ -387,14 +383,7 @@ class Session:
             why = f"module {serial} came when all had been measured"
             self._note_exclusion(serial, why, by_limits=False)
 
-    async def _stop_keeping(self) -> None:
-        if self._keeper is not None:
-            self._keeper.cancel()
-            await asyncio.gather(self._keeper, return_exceptions=True)
-            self._keeper = None
-
     async def _abandon(self, error: BaseException) -> None:
-        await self._stop_keeping()
         why = str(error) or type(error).__name__
         unconfirmed = await self.group.stop_all(why[:200])
         text = f"stopped: {why}" + (f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else "")

@@ -10,8 +10,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender, gather_all
-from coordinator.live_robot.module_group import POLL_S, ModuleGroup
+from coordinator.live_robot.commander import POLL_S
+from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Recording
 from coordinator.torque_control.feed_forward import RATE_HZ, Reference, standing
 from coordinator.torque_control.gravity_compensation import StaleFeedback
@@ -134,20 +135,17 @@ class FollowSession:
         infos = [self._group.info(serial) for serial in self._serials]
         check_motion_limits(self._model, reference, [info.limits for info in infos])
         self._stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in infos)
-        keeper = asyncio.create_task(self._group.keep_alive())
         try:
-            await gather_all(self._group.acquire(serial) for serial in self._serials)
+            await self._group.acquire()
             measured = [await self._mode(mode, reference) for mode in self._plan.modes]
             await self._go(stood_rad)
             await self._group.release_all()
         except BaseException as error:
-            await _cancelled(keeper)
             why = str(error) or type(error).__name__
             unconfirmed = await self._group.stop_all(why[:200])
             missing = f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else ""
             self._screen.note(f"stopped: {why}{missing}")
             raise
-        await _cancelled(keeper)
         return FollowResult(
             robot=self._name,
             motion=self._motion.path.name,

@@ -10,8 +10,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from coordinator.live_robot.commander import POLL_S
 from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender, gather_all
-from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Recording
 from coordinator.torque_control.gains import compensation_gains, holding_gains
 from coordinator.torque_control.gravity_compensation import (
@@ -144,21 +145,12 @@ class CompensationSession:
         if self._asked:
             return self._tally.summary(self._asked, is_fault=False)
         try:
-            # Until the stream renews the leases: none must expire while the next module is slow to answer.
-            keeper = asyncio.create_task(self._group.keep_alive())
-            try:
-                await gather_all(self._group.acquire(serial) for serial in self._serials)
-            finally:
-                await _cancelled(keeper)
+            await self._group.acquire()
             self._streaming = asyncio.create_task(self._stream(compensator))
             await self._compensate(compensator)
             await self._return(compensator, stood.q_rad)
             await _cancelled(self._streaming)
-            keeper = asyncio.create_task(self._group.keep_alive())
-            try:
-                await self._group.release_all()
-            finally:
-                await _cancelled(keeper)
+            await self._group.release_all()
         except BaseException as error:
             if self._streaming is not None:
                 await _cancelled(self._streaming)
@@ -209,17 +201,13 @@ class CompensationSession:
             await asyncio.sleep(POLL_S)
 
     async def _stream(self, compensator: GravityCompensator) -> None:
-        """Send set-points at their rate, renew the leases, and drop old rows."""
+        """Send set-points at their rate, and drop old rows."""
         period_s = 1.0 / self._plan.rate_hz
         due_s = forgot_s = self._now_s()
-        renewed_s = due_s - KEEP_ALIVE_S
         while True:
             now_s = self._now_s()
             self._states.check()
             self._step(compensator, now_s)
-            if now_s - renewed_s >= KEEP_ALIVE_S:
-                self._group.renew()
-                renewed_s = now_s
             if now_s - forgot_s >= _FORGET_EVERY_S:
                 for serial in self._serials:
                     self._group.module(serial).forget(_RETAINED_ROWS, 0)

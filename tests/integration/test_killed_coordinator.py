@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from coordinator.live_robot.module_group import KEEP_ALIVE_S, LEASE_NS
+from coordinator.live_robot.commander import KEEP_ALIVE_S, LEASE_NS
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 from module_agent.wire.feedback_rows import STATE_NAMES

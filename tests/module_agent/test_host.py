@@ -40,9 +40,7 @@ async def _explore(group: Any, joint: str) -> None:
     """The motions of an exploration, without all else that a session does."""
     await asyncio.sleep(0.2)
     await group.meet([BASE, TIP])
-    for serial in group.serials:
-        await group.acquire(serial)
-    keeper = asyncio.create_task(group.keep_alive())
+    await group.acquire()
     await group.run(dict.fromkeys(group.serials, Rest(duration_s=1.0)))
     for pattern in (
         GoTo(target_rad=-0.45, max_speed_rad_s=1.2),
@@ -56,7 +54,6 @@ async def _explore(group: Any, joint: str) -> None:
             # As a session does: the next motion waits until everybody has understood this one.
             for observer in group.serials:
                 assert await group.estimate(observer, joint, record.motion_id, 0.6) is not None
-    keeper.cancel()
 
 
 @pytest.mark.parametrize(("network", "seed"), [("none", 0), ("wifi", 1), ("bad", 2), ("bad", 3)])

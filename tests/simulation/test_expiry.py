@@ -13,6 +13,7 @@ from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, WindowedSine
 from module_agent.wire.refusal import WireError
 from sim.physics.engine import Physics
+from tests.rig import silent
 
 BASE = "X-00009"
 HORIZONTAL, VERTICAL = "thesis_171_horizontal", "thesis_171_vertical"
@@ -58,7 +59,6 @@ class Blackbox:
             await asyncio.sleep(0.1)
             await group.meet([BASE])
             await group.acquire(BASE)
-            keeper = asyncio.create_task(group.keep_alive())
             motion = asyncio.create_task(group.run({BASE: BRISK}))
             await asyncio.sleep(after_s)
             assert self.rig.state(BASE) == "moving"
@@ -66,9 +66,9 @@ class Blackbox:
                 self.rig.network.kill("tester")
             elif how == "partitioned":
                 self.rig.cut = True
-            keeper.cancel()
             motion.cancel()
-            await asyncio.sleep(1.3)
+            with silent(group):
+                await asyncio.sleep(1.3)
 
         self.rig.run(work())
 
@@ -110,7 +110,6 @@ def test_it_stays_off_when_the_network_comes_back_with_old_commands(rigs: Callab
         await asyncio.sleep(0.1)
         await group.meet([BASE])
         await group.acquire(BASE)
-        keeper = asyncio.create_task(group.keep_alive())
         await asyncio.sleep(0.5)
         rig.cut = True
         await asyncio.sleep(0.6)
@@ -121,7 +120,6 @@ def test_it_stays_off_when_the_network_comes_back_with_old_commands(rigs: Callab
         assert recording.modules[BASE].status.expiries == 1
         await group.acquire(BASE)
         assert rig.state(BASE) == "armed"
-        keeper.cancel()
 
     rig.run(work())
 
@@ -168,12 +166,10 @@ def test_a_stop_brings_a_moving_arm_to_rest_and_leaves_it_there(rigs: Callable[.
         await asyncio.sleep(0.1)
         await group.meet([BASE])
         await group.acquire(BASE)
-        keeper = asyncio.create_task(group.keep_alive())
         motion = asyncio.create_task(group.run({BASE: BRISK}))
         await asyncio.sleep(1.1)
         assert await group.stop_all("test") == []
         stopped_ns = box.rig.loop.now_ns
-        keeper.cancel()
         motion.cancel()
         await asyncio.sleep(2.0)
 

@@ -130,7 +130,7 @@ def test_a_stop_by_somebody_else_a_dead_agent_and_a_large_error_stop_all_modules
 
     async def stop() -> None:
         await other.meet([LIFT])
-        await messenger.stop(LIFT, other.sender, "enough")
+        await messenger.stop(LIFT, other.commander.sender, "enough")
 
     rig.when(lambda: streams(rig), lambda: rig.loop.create_task(stop()))
     with pytest.raises(RobotStopped, match=f"module {LIFT} was stopped by other: enough"):

@@ -272,7 +272,7 @@ def test_somebody_elses_stop_ends_it_and_is_not_overruled(rigs: Callable[..., An
         while not seen.floats:
             await asyncio.sleep(0.05)
         await other.meet([LIFT])
-        await messenger.stop(LIFT, other.sender, "enough")
+        await messenger.stop(LIFT, other.commander.sender, "enough")
         await work
 
     with pytest.raises(RobotStopped, match=f"module {LIFT} was stopped by other: enough"):
@@ -306,14 +306,14 @@ def test_no_joint_is_off_where_a_module_takes_longer_to_take_than_a_lease_lasts(
 ) -> None:
     rig = rigs(ARM, "lan")
     floating, seen = session(rig, CompensationPlan(for_s=0.3, final_hold_s=0.0, returns=False))
-    acquire = floating._group.acquire
+    acquire = floating._group.commander.acquire
 
     async def slow(serial: str) -> None:
         if serial == ELBOW:
             await asyncio.sleep(0.6)
         await acquire(serial)
 
-    monkeypatch.setattr(floating._group, "acquire", slow)
+    monkeypatch.setattr(floating._group.commander, "acquire", slow)
     off: set[str] = set()
 
     def watch() -> None:
@@ -332,7 +332,7 @@ def test_a_joint_that_executes_no_set_point_from_the_start_ends_it(
     """Its lease is renewed or not: all that it gets are no set-points."""
     rig = rigs(ARM, "lan")
     floating, seen = session(rig)
-    stream, renew = floating._group.stream, floating._group.renew
+    stream, renew = floating._group.stream, floating._group.commander.renew
 
     def deaf(serial: str, *aims: float | None) -> None:
         if serial != LIFT:
@@ -340,7 +340,12 @@ def test_a_joint_that_executes_no_set_point_from_the_start_ends_it(
 
     monkeypatch.setattr(floating._group, "stream", deaf)
     if state == "expired":
-        monkeypatch.setattr(floating._group, "renew", lambda: renew() if rig.loop.time() < 0.5 else None)
+        until_s = 0.5
+        monkeypatch.setattr(
+            floating._group.commander,
+            "renew",
+            lambda **how: renew(**how) if rig.loop.time() < until_s else None,
+        )
     with pytest.raises(ModuleLost, match=f"module {LIFT} is lost: .* {state}"):
         rig.run(floating.run())
     assert not seen.floats
@@ -356,11 +361,7 @@ def test_a_module_that_somebody_holds_is_not_taken_from_him(rigs: Callable[..., 
         await asyncio.sleep(0.1)
         await other.meet([LIFT])
         await other.acquire(LIFT)
-        keeper = asyncio.ensure_future(other.keep_alive())
-        try:
-            await floating.run()
-        finally:
-            keeper.cancel()
+        await floating.run()
 
     with pytest.raises(Refused, match=f"module {LIFT} refused lease: HELD|held by other"):
         rig.run(both())

@@ -74,13 +74,10 @@ def life(rigs: Callable[..., Any], seed: int, observed: bool = False) -> tuple[s
     async def move(target_rad: float) -> None:
         await asyncio.sleep(0.1)
         await group.meet(rig.serials)
-        for serial in rig.serials:
-            await group.acquire(serial)
-        keeper = asyncio.create_task(group.keep_alive())
+        await group.acquire()
         with suppress(RobotError):
             for serial in rig.serials:
                 await group.run({serial: GoTo(target_rad=target_rad, max_speed_rad_s=1.0)})
-        keeper.cancel()
 
     async def work() -> None:
         moving = asyncio.create_task(move(float(rng.uniform(-0.5, 0.5))))

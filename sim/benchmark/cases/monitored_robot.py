@@ -12,7 +12,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.live_robot.errors import MotionInterrupted
-from coordinator.live_robot.messenger import Messenger, Sender, gather_all
+from coordinator.live_robot.messenger import Messenger, Sender
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
@@ -114,8 +114,7 @@ async def move_about(
         await asyncio.sleep(0.05)
     await group.meet(sorted(messenger.alive))
     await asyncio.sleep(0.3)
-    keeper = asyncio.create_task(group.keep_alive())
-    await gather_all(group.acquire(serial) for serial in group.serials)
+    await group.acquire()
     turn = 0
     while loop.now_ns < until_ns:
         motion = motions[turn % len(motions)]
@@ -127,7 +126,5 @@ async def move_about(
             await group.run(dict(motion.patterns))
         except MotionInterrupted:
             # A collision may make a module drop its lease; the mover acquires it again.
-            await gather_all(group.acquire(serial) for serial in group.serials)
+            await group.acquire()
     await group.release_all()
-    keeper.cancel()
-    await asyncio.gather(keeper, return_exceptions=True)

@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.live_robot.commander import KEEP_ALIVE_S, POLL_S
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted
-from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused, gather_all
-from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
+from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused
+from coordinator.live_robot.module_group import ModuleGroup
 from module_agent.control.motion import effort_profile
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.transport.transport import TransportError
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest, Setpoint
+from tests.rig import silent
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -30,12 +32,9 @@ async def _met(group: ModuleGroup, *serials: str) -> None:
     await group.meet(serials or (BASE, TIP))
 
 
-async def _armed(group: ModuleGroup, *serials: str) -> asyncio.Task[None]:
-    """Meet, take, and keep alive until the task is cancelled."""
+async def _armed(group: ModuleGroup, *serials: str) -> None:
     await _met(group, *serials)
-    for serial in group.serials:
-        await group.acquire(serial)
-    return asyncio.create_task(group.keep_alive())
+    await group.acquire()
 
 
 def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Callable[..., Any]) -> None:
@@ -43,7 +42,7 @@ def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Cal
     _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         there = await group.run({BASE: GoTo(target_rad=0.4, max_speed_rad_s=0.8)})
         both = await group.run(
             {BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.3), TIP: Rest(duration_s=0.2)}
@@ -55,7 +54,6 @@ def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Cal
             rows = recording.rows(serial, record.start_row, record.end_row)
             assert len(rows) == record.end_row - record.start_row
             assert set(rows["motion_id"].tolist()) == {record.motion_id}
-        keeper.cancel()
         await group.release_all()
 
     rig.run(work())
@@ -67,7 +65,7 @@ def test_an_expiry_before_the_lease_does_not_end_the_first_motion_under_it(rigs:
     _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         for target in (0.1, 0.0, 0.1, 0.0):
             module = recording.modules[TIP]
             assert module.status is not None
@@ -75,7 +73,6 @@ def test_an_expiry_before_the_lease_does_not_end_the_first_motion_under_it(rigs:
             module.status = module.status.model_copy(update={"state": "expired", "motion": None, "t_ns": 1})
             done = await group.run({TIP: GoTo(target_rad=target, max_speed_rad_s=0.8)})
             assert done[TIP].outcome == "done"
-        keeper.cancel()
         await group.release_all()
 
     rig.run(work())
@@ -107,7 +104,7 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
 
     async def work() -> dict[str, int]:
         nonlocal interrupted
-        keeper = await _armed(group)
+        await _armed(group)
         for target in (0.3, 0.0, 0.3, 0.0):
             for _ in range(5):
                 try:
@@ -115,11 +112,9 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
                     break
                 except MotionInterrupted:
                     interrupted += 1
-                    for serial in group.serials:
-                        await group.acquire(serial)
+                    await group.acquire()
         end_rows = {serial: recording.modules[serial].rows.end_row for serial in group.serials}
         await group.complete_rows()
-        keeper.cancel()
         await group.release_all()
         return end_rows
 
@@ -136,14 +131,13 @@ def test_duplicated_messages_have_no_second_effect(rigs: Callable[..., Any]) -> 
     _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         for target in (0.3, 0.0):
             assert (await group.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)}))[
                 BASE
             ].outcome == "done"
         await group.set_gains(BASE, group.info(BASE).gains)
         assert recording.modules[BASE].status.token == 1
-        keeper.cancel()
         await group.release_all()
 
     rig.run(work())
@@ -157,18 +151,18 @@ def test_a_second_commander_is_refused_with_holder_and_time_left(
     _, _, second = rig.group("second")
 
     async def work() -> None:
-        keeper = await _armed(first)
+        await _armed(first)
         await _met(second)
         with pytest.raises(Refused, match=r"refused lease: held: held by first for another \d\.\d\d s"):
             await second.acquire(BASE)
         with pytest.raises(Refused, match="held by first, not by second"):
             await second.run({BASE: SLOW})
-        # Once the first lets go, or dies, the second gets it.
-        keeper.cancel()
-        await asyncio.sleep(1.2)
-        await second.acquire(BASE)
-        with pytest.raises(MotionInterrupted):
-            await first.run({TIP: SLOW})
+        # Once the first has died, the second gets it.
+        with silent(first):
+            await asyncio.sleep(1.2)
+            await second.acquire(BASE)
+            with pytest.raises(MotionInterrupted):
+                await first.run({TIP: SLOW})
 
     rig.run(work())
 
@@ -179,15 +173,13 @@ def test_a_holder_whose_lease_is_taken_notices(rigs: Callable[..., Any]) -> None
     _, _, second = rig.group("second")
 
     async def work() -> None:
-        keeper = await _armed(first)
+        await _armed(first)
         await _met(second)
-        keeper.cancel()
-        await asyncio.sleep(1.1)
-        await second.acquire(BASE)
-        keeper = asyncio.create_task(first.keep_alive())
+        with silent(first):
+            await asyncio.sleep(1.1)
+            await second.acquire(BASE)
         with pytest.raises(ModuleLost, match=f"module {BASE} is lost: its lease was taken: held by second"):
             await first.wait(lambda: False, 1.0)
-        keeper.cancel()
 
     rig.run(work())
 
@@ -205,14 +197,12 @@ def test_of_many_modules_eight_in_turn_answer_a_keep_alive_and_all_stay_held(
     _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = asyncio.create_task(group.keep_alive())
         await _met(group, *rig.serials)
-        await gather_all(group.acquire(serial) for serial in rig.serials)
+        await group.acquire()
         await asyncio.sleep(0.5)
         said.clear()
         await group.wait(lambda: False, 50 * KEEP_ALIVE_S)
         assert {rig.state(serial) for serial in rig.serials} == {"armed"}
-        keeper.cancel()
 
     rig.run(work())
     # Half of sixteen are asked each time; a lossy network is poor, so that all are renewed twice as often.
@@ -235,9 +225,8 @@ def test_on_a_poor_network_each_of_many_running_motions_is_commanded_again_and_i
     _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = asyncio.create_task(group.keep_alive())
         await _met(group, *rig.serials)
-        await gather_all(group.acquire(serial) for serial in rig.serials)
+        await group.acquire()
         await group.wait(lambda: group.is_poor, 5.0)
         running = asyncio.create_task(group.run(dict.fromkeys(rig.serials, Rest(duration_s=3.0))))
         await asyncio.sleep(0.5)
@@ -246,7 +235,6 @@ def test_on_a_poor_network_each_of_many_running_motions_is_commanded_again_and_i
         assert group.is_poor
         again = dict(said)
         await running
-        keeper.cancel()
         # In two seconds 33 keep-alives, of which every second asks.
         for serial in rig.serials:
             assert again[serial, Leaf.MOTION] >= 15
@@ -264,14 +252,13 @@ def test_of_many_modules_too_a_lease_that_is_taken_is_noticed(rigs: Callable[...
     async def work() -> None:
         for group in (first, second):
             await _met(group, *rig.serials)
-        await gather_all(first.acquire(serial) for serial in rig.serials)
-        await asyncio.sleep(1.1)
+        await first.acquire()
         taken = rig.serials[-1]
-        await second.acquire(taken)
-        keeper = asyncio.create_task(first.keep_alive())
+        with silent(first):
+            await asyncio.sleep(1.1)
+            await second.acquire(taken)
         with pytest.raises(ModuleLost, match=f"module {taken} is lost: its lease was taken: held by second"):
             await first.wait(lambda: False, 2 * KEEP_ALIVE_S + POLL_S)
-        keeper.cancel()
 
     rig.run(work())
 
@@ -282,12 +269,11 @@ def test_a_module_whose_lease_was_taken_once_can_be_held_again(rigs: Callable[..
     _, _, second = rig.group("second")
 
     async def work() -> None:
-        keeper = await _armed(first, BASE)
+        await _armed(first, BASE)
         await _met(second, BASE)
-        keeper.cancel()
-        await asyncio.sleep(1.1)
-        await second.acquire(BASE)
-        keeper = asyncio.create_task(first.keep_alive())
+        with silent(first):
+            await asyncio.sleep(1.1)
+            await second.acquire(BASE)
         with pytest.raises(ModuleLost, match="its lease was taken"):
             await first.wait(lambda: False, 1.0)
         await second.release_all()
@@ -295,7 +281,6 @@ def test_a_module_whose_lease_was_taken_once_can_be_held_again(rigs: Callable[..
         await first.run({BASE: Rest(duration_s=0.3)})
         assert await first.stop_all("for the test") == []
         assert rig.state(BASE) == "stopped"
-        keeper.cancel()
 
     rig.run(work())
 
@@ -306,18 +291,15 @@ def test_a_module_that_another_holds_now_is_not_stopped_with_the_others(rigs: Ca
     _, _, second = rig.group("second")
 
     async def work() -> None:
-        await _met(first)
+        await _armed(first)
         await _met(second)
-        for serial in (BASE, TIP):
-            await first.acquire(serial)
-        await asyncio.sleep(1.1)
-        await second.acquire(BASE)
-        keeper = asyncio.create_task(second.keep_alive())
-        with pytest.raises(Refused, match="held by second"):
-            await first.acquire(BASE)
+        with silent(first):
+            await asyncio.sleep(1.1)
+            await second.acquire(BASE)
+            with pytest.raises(Refused, match="held by second"):
+                await first.acquire(BASE)
         assert await first.stop_all("for the test") == []
         assert [rig.state(serial) for serial in (BASE, TIP)] == ["armed", "stopped"]
-        keeper.cancel()
 
     rig.run(work())
 
@@ -338,13 +320,11 @@ def test_one_renewal_that_cannot_be_sent_does_not_end_those_of_the_others(
     monkeypatch.setattr(messenger, "publish", failing)
 
     async def work() -> None:
-        keeper = asyncio.create_task(group.keep_alive())
         await _met(group, *rig.serials)
-        await gather_all(group.acquire(serial) for serial in rig.serials)
+        await group.acquire()
         await asyncio.sleep(1.0)
         assert failed
         assert {rig.state(serial) for serial in rig.serials} == {"armed"}
-        keeper.cancel()
 
     rig.run(work())
 
@@ -355,11 +335,10 @@ def test_a_motion_may_take_as_long_as_from_where_the_joint_stands(rigs: Callable
     _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         for target_rad, speed_rad_s in ((1.2, 1.5), (0.0, 1.5), (1.2, 0.3)):
             there = await group.run({BASE: GoTo(target_rad=target_rad, max_speed_rad_s=speed_rad_s)})
             assert there[BASE].outcome == "done"
-        keeper.cancel()
 
     rig.run(work())
 
@@ -474,7 +453,7 @@ def test_a_permanent_refusal_is_raised_at_once(rigs: Callable[..., Any]) -> None
     _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         running = asyncio.create_task(group.run({BASE: SLOW}))
         await asyncio.sleep(0.5)
         with pytest.raises(Refused, match=r"refused motion: busy: motion .* is running"):
@@ -482,7 +461,6 @@ def test_a_permanent_refusal_is_raised_at_once(rigs: Callable[..., Any]) -> None
         # The motion that runs is none the worse for it.
         assert (await running)[BASE].outcome == "done"
         assert recording.modules[BASE].status.refusals == {"busy": 1}
-        keeper.cancel()
 
     rig.run(work())
 
@@ -492,20 +470,17 @@ def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callab
     _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
-        keeper.cancel()
+        await _armed(group)
         # Either may expire first, by the age of its last feedback.
         other = f"interrupted: module {TIP} expired and released its joint"
         why = f"the motion of module {BASE} was (expired|{other})"
-        with pytest.raises(MotionInterrupted, match=why):
-            await group.run({BASE: SLOW})
-        await asyncio.sleep(0.05)
+        with silent(group):
+            with pytest.raises(MotionInterrupted, match=why):
+                await group.run({BASE: SLOW})
+            await asyncio.sleep(0.05)
         assert rig.state(BASE) == "expired"
-        for serial in group.serials:
-            await group.acquire(serial)
-        keeper = asyncio.create_task(group.keep_alive())
+        await group.acquire()
         assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"
-        keeper.cancel()
 
     rig.run(work())
     assert rig.world.plant.q_rad[0] == pytest.approx(1.0, abs=0.05)
@@ -532,13 +507,11 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
     monkeypatch.setattr(messenger, "command", command)
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         with pytest.raises(MotionInterrupted, match="was expired: use a new number"):
             await group.run({BASE: SLOW})
-        for serial in group.serials:
-            await group.acquire(serial)
+        await group.acquire()
         assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"
-        keeper.cancel()
 
     rig.run(work())
     assert [ack.accepted for ack in lost] == [True]
@@ -563,10 +536,8 @@ def test_no_motion_at_all_is_done_at_once(rigs: Callable[..., Any]) -> None:
     _, _, group = rig.group()
 
     async def work() -> dict[str, Any]:
-        keeper = await _armed(group)
-        done = await group.run({})
-        keeper.cancel()
-        return done
+        await _armed(group)
+        return await group.run({})
 
     assert rig.run(work()) == {}
 
@@ -574,18 +545,17 @@ def test_no_motion_at_all_is_done_at_once(rigs: Callable[..., Any]) -> None:
 @pytest.mark.parametrize("own", [True, False])
 def test_set_points_of_another_program_with_the_secret_are_named(rigs: Callable[..., Any], own: bool) -> None:
     rig = rigs(ARM, "lan")
-    messenger, _, group = rig.group()
+    _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         for _ in range(10):
             if own:
                 group.stream(BASE, None, 0.2, None)
             else:
                 aims = {"position_rad": None, "velocity_rad_s": 0.2, "effort_nm": None}
-                messenger.publish(BASE, Leaf.SETPOINT, group._command(Setpoint, BASE, **aims), group._secret)
+                group.commander.publish(BASE, Leaf.SETPOINT, group.commander.command(Setpoint, BASE, **aims))
             await asyncio.sleep(0.02)
-        keeper.cancel()
         group.check()
 
     if own:
@@ -600,7 +570,7 @@ def test_lost_feedback_and_estimates_are_fetched(rigs: Callable[..., Any]) -> No
     _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         await asyncio.sleep(1.0)
         rows = recording.modules[BASE].rows
         assert rows.missing(rows.first_row, rows.end_row)  # 5 % are lost: the test would test nothing
@@ -616,7 +586,6 @@ def test_lost_feedback_and_estimates_are_fetched(rigs: Callable[..., Any]) -> No
         assert estimate is not None
         assert estimate.moved
         assert await group.estimate(TIP, BASE, 12345, 0.01) is None
-        keeper.cancel()
 
     rig.run(work())
 
@@ -627,14 +596,12 @@ def test_motion_numbers_grow_from_one_coordinator_to_the_next(rigs: Callable[...
     _, _, second = rig.group("second")
 
     async def work() -> None:
-        keeper = await _armed(first, BASE)
+        await _armed(first, BASE)
         pattern = Rest(duration_s=0.05)
         mine = [(await first.run({BASE: pattern}))[BASE].motion_id for _ in range(3)]
-        keeper.cancel()
         await first.release_all()
-        keeper = await _armed(second, BASE)
+        await _armed(second, BASE)
         theirs = (await second.run({BASE: pattern}))[BASE].motion_id
-        keeper.cancel()
         assert mine[0] < mine[1] < mine[2] < theirs
 
     rig.run(work())
@@ -671,10 +638,7 @@ def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
 
     async def work() -> None:
         await _met(group)
-        # First, as in a session: what is armed must hear renewals while the next answers slowly.
-        keeper = asyncio.create_task(group.keep_alive())
-        for serial in group.serials:
-            await group.acquire(serial)
+        await group.acquire()
         both = await group.run({BASE: rest, TIP: rest}, {BASE: ramp})
         after = await group.run({BASE: rest, TIP: rest})
         await group.complete_rows()
@@ -684,7 +648,6 @@ def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
         np.testing.assert_allclose(_fed(recording, both[BASE], BASE)[1:], wanted[1:], atol=2.0 * 4e-3)
         for record, serial in ((both[TIP], TIP), (after[BASE], BASE), (after[TIP], TIP)):
             assert np.isnan(_fed(recording, record, serial)[1:]).all()
-        keeper.cancel()
         await group.release_all()
 
     rig.run(work())
@@ -697,12 +660,11 @@ def test_efforts_for_a_module_without_a_motion_are_refused_before_anything_moves
     _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         with pytest.raises(
             KeyError, match=f"efforts for {TIP}, which has no motion; of those that have one: {BASE}"
         ):
             await group.run({BASE: SLOW}, {TIP: effort_profile([0.0, 1.0], 10_000_000)})
-        keeper.cancel()
         await group.release_all()
 
     rig.run(work())
@@ -719,10 +681,7 @@ def test_with_slow_renewals_motions_are_commanded_again_and_run_once(
 
     async def work() -> None:
         await _met(group)
-        # First, as in a session: what is armed must hear renewals while the next answers slowly.
-        keeper = asyncio.create_task(group.keep_alive())
-        for serial in group.serials:
-            await group.acquire(serial)
+        await group.acquire()
         record = (await group.run({BASE: SLOW}))[BASE]
         assert record.outcome == "done"
         assert group.is_poor == is_poor
@@ -730,7 +689,6 @@ def test_with_slow_renewals_motions_are_commanded_again_and_run_once(
         assert (len(sent) > 1) == is_poor
         # Newer than each other, as renewals are: a copy that is late has no say.
         assert [command.seq for command in sent] == sorted({command.seq for command in sent})
-        keeper.cancel()
         await group.complete_rows()
 
     rig.run(work())
@@ -747,20 +705,19 @@ def test_a_motion_during_which_another_joint_expires_is_interrupted(
 
     async def command(serial: str, leaf: Leaf, message: Message, *how: Any) -> Ack:
         if serial == TIP and leaf is Leaf.LEASE and rig.state(BASE) == "moving":
+            await asyncio.sleep(0.1)
             raise NoAnswer(serial, leaf, "Timeout")
         return await Messenger.command(messenger, serial, leaf, message, *how)
 
     monkeypatch.setattr(messenger, "command", command)
 
     async def work() -> None:
-        keeper = await _armed(group)
+        await _armed(group)
         why = f"the motion of module {BASE} was interrupted: module {TIP} expired and released its joint"
         with pytest.raises(MotionInterrupted, match=why):
             await group.run({BASE: SLOW})
         # Armed again, both move as before.
-        for serial in group.serials:
-            await group.acquire(serial)
-        keeper.cancel()
+        await group.acquire()
 
     rig.run(work())
 
@@ -771,7 +728,7 @@ def test_many_gaps_of_all_modules_are_fetched_concurrently(rigs: Callable[..., A
     _, recording, group = rig.group()
 
     async def work() -> float:
-        keeper = await _armed(group)
+        await _armed(group)
         await group.complete_rows()
         for _ in range(20):
             rig.cut = True
@@ -780,7 +737,6 @@ def test_many_gaps_of_all_modules_are_fetched_concurrently(rigs: Callable[..., A
             await asyncio.sleep(0.06)
         begun_s = rig.loop.time()
         await group.complete_rows()
-        keeper.cancel()
         return rig.loop.time() - begun_s
 
     taken_s = rig.run(work())

@@ -289,10 +289,8 @@ def test_who_holds_a_module_is_named_where_it_cannot_be_held(follower: Follower)
         await group.acquire("X-00010")
 
     follower.rig.run(hold())
-    keeper = follower.rig.loop.create_task(group.keep_alive())
     follower.rig.loop.call_later(1.0, follower.live.hold)
     follower.follow(3.0)
-    keeper.cancel()
     assert any("another" in note for note in follower.notes)
     assert not follower.live.holds
 
