@@ -148,7 +148,7 @@ class ModuleGroup:
             if serial not in self._messenger.alive and silent_ns > TOKEN_GONE_NS:
                 raise ModuleLost(serial, "its agent has left the network")
             if silent_ns > SILENT_NS:
-                raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s")
+                raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s{_trouble(record.status)}")
             self.commander.check_lease(serial)
             status = self.status_under_lease(serial)
             if status is not None and status.state == "stopped":
@@ -321,7 +321,8 @@ class ModuleGroup:
             self.commander.repeat(serial, Leaf.MOTION, command)
         except Refused as refused:
             if refused.ack.reason in UNSTARTED:
-                raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused
+                trouble = _trouble(await self.ask_status(serial))
+                raise MotionInterrupted(serial, f"refused: {refused.ack.detail}{trouble}") from refused
             raise
 
     # ------------------------------------------------------------------ recordings
@@ -377,6 +378,13 @@ class ModuleGroup:
             if await self.wait(lambda: received() is not None, 0.3):
                 break
         return received()
+
+
+def _trouble(status: Status | None) -> str:
+    """Return what a module says is wrong with it, to be added to a sentence."""
+    if status is None or status.state not in ("fault", "expired") or not status.note:
+        return ""
+    return f"; it says: {status.note}"
 
 
 def _unfinished(status: Status | None) -> str:

@@ -15,6 +15,9 @@ Times = NDArray[np.int64]
 STEP_NS, EVEN_WITHIN = 4_000_000, 0.05
 # A longer hole is not bridged.
 MAX_HOLE_NS = 100_000_000
+# As many samples as a motion of a minute has at 1 kHz, with its margins. Times that another module sends may
+# be anything, and must not fill this one's memory.
+MAX_EVEN_SAMPLES = 65_536
 
 
 class ImuWindow(NamedTuple):
@@ -68,7 +71,7 @@ def even(window: Samples, step_ns: float = STEP_NS) -> Samples:
     """Return a window at even steps: interpolated by a cubic spline, unless it is so already.
 
     Raises:
-        DataError: fewer than 4 samples, or a hole over `MAX_HOLE_NS`.
+        DataError: fewer than 4 samples, a hole over `MAX_HOLE_NS`, or over `MAX_EVEN_SAMPLES` to be made.
     """
     t_ns, *signals = window
     steps = np.diff(t_ns)
@@ -79,6 +82,12 @@ def even(window: Samples, step_ns: float = STEP_NS) -> Samples:
     if steps.max() > MAX_HOLE_NS:
         raise DataError(
             f"a hole of {1e-6 * steps.max():.0f} ms; at most {1e-6 * MAX_HOLE_NS:.0f} are bridged"
+        )
+    count = int(t_ns[-1] - t_ns[0]) / max(step_ns, 1.0)
+    if count > MAX_EVEN_SAMPLES:
+        raise DataError(
+            f"{t_ns.size} samples over {1e-9 * (t_ns[-1] - t_ns[0]):.1f} s, most of them "
+            f"{1e-6 * step_ns:.3g} ms apart: at most {MAX_EVEN_SAMPLES} even ones are made of them"
         )
     at_ns = np.arange(t_ns[0], t_ns[-1] + 1, round(step_ns))
     knots, at = 1e-9 * (t_ns - t_ns[0]), 1e-9 * (at_ns - t_ns[0])

@@ -94,6 +94,7 @@ class QuietState(NamedTuple):
     now_ns: int
     targets: tuple[float, ...]
     limited: int
+    behind_ns: int
     winding_c: float
     row_times: tuple[int, int]
     row_periods: tuple[int, int, int, bool]
@@ -139,6 +140,8 @@ class Firmware:
         self._sample: ModuleSample | None = None
         self._out: list[Outgoing] = []
         self._status_due_ns = 0
+        # By how much the clock has fallen behind one that runs at half its rate.
+        self._behind_ns = 0
         self._note = ""
         modules.set_lifetime(index, config.lifetime_ns)
         self._gains = self._kept_gains = modules.information[index].gains
@@ -148,13 +151,17 @@ class Firmware:
 
     def step(self, sample: ModuleSample, inbox: Sequence[Incoming]) -> Command:
         """Begin a tick: expire what is stale, read the inbox; return the command for the module."""
-        self._sample = sample
+        is_first, self._sample = self._sample is None, sample
         self._limited |= sample.limits
         sensors = sample.sensors
         # No message can carry a time before the clock's zero: until then the module is in fault, at 0.
         now_ns, before_ns = max(sensors.t_ns, 0), self._now_ns
         self._now_ns = now_ns
-        if now_ns <= before_ns and before_ns > 0:
+        # Only a clock that runs slower than at half its rate falls behind for long. Once it runs again, it is
+        # well after two lifetimes.
+        behind_ns = self._behind_ns + self.config.tick_ns // 2 - max(now_ns - before_ns, 0)
+        self._behind_ns = min(max(behind_ns, 0), 2 * self.config.lifetime_ns)
+        if now_ns <= before_ns and not is_first:
             self._begin_time_anew(before_ns)
         elif self.state in COMMANDED and 2 * (now_ns - before_ns) > self.config.lifetime_ns:
             self._expire()
@@ -171,7 +178,7 @@ class Firmware:
             self._finish_motion("fault")
             self._enter("fault", f"winding at {sensors.winding_temperature_c:.0f} C")
             self._hot = True
-        if (fault := _fault(sample)) and self.state != "fault":
+        if (fault := self._fault(sample)) and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", fault)
         if sample.m_stop:
@@ -220,14 +227,23 @@ class Firmware:
             now_ns=self._now_ns,
             targets=self._command[:3],
             limited=int(self._limited),
+            behind_ns=self._behind_ns,
             winding_c=self.config.safety.winding_c,
             row_times=self._rows.times_ns,
             row_periods=self._rows.periods,
         )
 
-    def go_on(self, now_ns: int, targets: Sequence[float], due_ns: int, imu_ns: int, limited: int) -> None:
-        """Go on from the time, the targets, the rows and the limits of a quiet tick."""
-        self._now_ns, self._limited = now_ns, limited
+    def go_on(
+        self,
+        now_ns: int,
+        targets: Sequence[float],
+        due_ns: int,
+        imu_ns: int,
+        limited: int,
+        behind_ns: int,
+    ) -> None:
+        """Go on from the time, the targets, the rows, the limits and the clock's lag of a quiet tick."""
+        self._now_ns, self._limited, self._behind_ns = now_ns, limited, behind_ns
         position_rad, velocity_rad_s, effort_nm = targets
         self._command = Command(position_rad, velocity_rad_s, effort_nm)
         self._rows.go_on(due_ns, imu_ns)
@@ -333,13 +349,29 @@ class Firmware:
         self._command = Command(self._sample.sensors.position_rad, 0.0, math.nan)
 
     def _begin_time_anew(self, before_ns: int) -> None:
-        """Let nothing that was granted by the clock before it went back be valid: no command, no lease."""
+        """Let nothing that was granted by the clock before it stood or went back be valid: command, lease."""
+        back_ns = before_ns - self._now_ns
         if self.state in COMMANDED:
             self._expire()
-            self._note = f"the module's clock went back by {(before_ns - self._now_ns) / 1e6:.0f} ms"
-        self._end_lease()
+            how = f"went back by {back_ns / 1e6:.0f} ms" if back_ns else "stands"
+            self._note = f"the module's clock {how}"
+        # While it stands there is nothing to end in every tick.
+        if self.lease.holder:
+            self._end_lease()
         self._fresh_ns = self._stopped_ns = 0
-        self._rows.begin_anew()
+        if back_ns:
+            self._rows.begin_anew()
+            self._status_due_ns = 0
+
+    def _fault(self, sample: ModuleSample) -> str:
+        """Return what the module reports to be wrong with it, or what is wrong with its clock."""
+        if sample.fault:
+            return sample.fault
+        t_ns = sample.sensors.t_ns
+        if t_ns < 0:
+            return f"the module's clock reads {t_ns} ns, before its zero"
+        is_behind = self._behind_ns > self.config.lifetime_ns
+        return "the module's clock stands, or runs slower than at half its rate" if is_behind else ""
 
     def _finish_motion(self, outcome: str) -> None:
         if self._motion is None or self._record is None:
@@ -409,7 +441,7 @@ class Firmware:
         self._hot = winding_c > cool_c if self._hot else winding_c >= self.config.safety.winding_c
         if self._hot:
             raise WireError(Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {cool_c:.0f} C")
-        if fault := _fault(self._sample):
+        if fault := self._fault(self._sample):
             raise WireError(Refusal.NOT_ARMED, fault)
         self._check_m_stop()
         if self.state == "stopped" and request.echo_ns <= self._stopped_ns:
@@ -523,12 +555,6 @@ class Firmware:
             gains=self._gains,
             t_ns=self._now_ns,
         )
-
-
-def _fault(sample: ModuleSample) -> str:
-    """Return what the module reports to be wrong with it, or what is wrong with its clock."""
-    t_ns = sample.sensors.t_ns
-    return sample.fault or (f"the module's clock reads {t_ns} ns, before its zero" if t_ns < 0 else "")
 
 
 def acknowledgement(

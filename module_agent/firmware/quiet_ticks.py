@@ -50,7 +50,7 @@ class QuietTicks:
         self._memory = np.zeros((modules, 3, kernel.MEMORY))
         self._motion = np.zeros((modules, 3, _SAMPLES))
         self._floats = np.zeros((modules, 4))
-        self._integers = np.zeros((modules, 6), np.int64)
+        self._integers = np.zeros((modules, kernel.INTEGERS), np.int64)
         self._last = Readings(modules)
         self._rows = np.zeros(modules, kernel.FLAT_ROW)
         # The rows of several ticks, of each module as many as `_held` says, and as `_room` says at most.
@@ -147,14 +147,14 @@ class QuietTicks:
         """Let the objects of a module go on from where its quiet ticks ended."""
         module = self._objects[place]
         assert module is not None
-        due_ns, imu_ns, running, limit, now_ns, limited = self._integers[place].tolist()
+        due_ns, imu_ns, running, limit, now_ns, limited, behind_ns = self._integers[place].tolist()
         if now_ns == self._run_ns[place]:
             # The objects have run the last tick.
             return
         if self._held[place]:
             self.keep_rows(place)
         floats = self._floats[place].tolist()
-        module.firmware.go_on(now_ns, floats[:3], due_ns, imu_ns, limited)
+        module.firmware.go_on(now_ns, floats[:3], due_ns, imu_ns, limited, behind_ns)
         pwm, memory = floats[kernel.PWM], self._memory[place].tolist()
         module.loops.go_on(module.number, self._last[place], pwm, bool(running), limit, memory)
 
@@ -190,7 +190,7 @@ class QuietTicks:
             *drive.bounds,
         )
         self._floats[place] = (*firmware.targets, drive.pwm)
-        own = drive.running, drive.limit, firmware.now_ns, firmware.limited
+        own = drive.running, drive.limit, firmware.now_ns, firmware.limited, firmware.behind_ns
         self._integers[place] = (*firmware.row_times, *own)
         self._memory[place] = [loop.memory for loop in controller.loops]
         self._run_ns[place] = firmware.now_ns

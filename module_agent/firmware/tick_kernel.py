@@ -54,9 +54,11 @@ LOOP = np.dtype(
 HAS_TARGET, TARGET, HAS_LAST, LAST_ERROR, LAST_MEASURED, INTEGRAL, HAS_OUTPUT, OUTPUT = range(8)
 MEMORY = 8
 # Of each module, floats: its targets and its PWM; integers: when a row is due, the last IMU time, whether its
-# loops run, what limits the PWM, the time of the last tick, and what has limited it since the last status.
+# loops run, what limits the PWM, the time of the last tick, what has limited it since the last status, and by
+# how much its clock has fallen behind one that runs at half its rate.
 POSITION, VELOCITY, EFFORT, PWM = range(4)
-ROW_DUE_NS, LAST_IMU_NS, RUNNING, LIMIT, NOW_NS, LIMITED = range(6)
+ROW_DUE_NS, LAST_IMU_NS, RUNNING, LIMIT, NOW_NS, LIMITED, BEHIND_NS = range(7)
+INTEGERS = 7
 
 # Columns of a reading, in the order of `SensorSample`.
 T_NS, IMU_NS = 0, 1
@@ -109,7 +111,7 @@ def tick(
 
     times, readings (n, 17) are one block of memory, the times its first two columns; last (n, 17) are those
     of the last tick. modules (n,) `MODULE`, most (n, 15) the largest readings, loops (n, 3) `LOOP`, memory
-    (n, 3, 8), motion (n, 3, samples) targets every millisecond, floats (n, 4), integers (n, 6), rows (n,)
+    (n, 3, 8), motion (n, 3, samples) targets every millisecond, floats (n, 4), integers (n, 7), rows (n,)
     `FLAT_ROW`.
     """
     others = 0
@@ -118,9 +120,16 @@ def tick(
         results[i] = NOT_QUIET
         imu_ns, before_ns, imu_before_ns = times[i, IMU_NS], integers[i, NOW_NS], integers[i, LAST_IMU_NS]
         is_imu_possible = imu_before_ns <= imu_ns <= now_ns
-        if not (own.ready and is_imu_possible and _is_quiet(own, now_ns, before_ns, readings[i], most[i])):
+        behind_ns = max(integers[i, BEHIND_NS] + own.half_tick_ns - (now_ns - before_ns), 0)
+        if not (
+            own.ready
+            and is_imu_possible
+            and behind_ns <= own.lifetime_ns
+            and _is_quiet(own, now_ns, before_ns, readings[i], most[i])
+        ):
             others += 1
             continue
+        integers[i, BEHIND_NS] = behind_ns
         integers[i, LIMITED] |= integers[i, LIMIT]
         if own.source == MOTION:
             step = (now_ns - own.motion_start_ns) // STEP_NS
@@ -312,7 +321,7 @@ def _limit(own: Any, pwm: float, integers: Integers, reading: Floats) -> float:
     room_c = own.ceiling_c - reading[WINDING]
     ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
     voltage_v = reading[VOLTAGE] if reading[VOLTAGE] > 0.0 else 0.0
-    max_pwm: float = ceiling * voltage_v / NOMINAL_VOLTAGE_V
+    max_pwm: float = min(ceiling * voltage_v / NOMINAL_VOLTAGE_V, 1.0)
     if -max_pwm <= pwm <= max_pwm:
         return pwm
     integers[LIMIT] |= LIMIT_TEMPERATURE if ceiling != 0.0 else LIMIT_OVER_TEMPERATURE

@@ -1,9 +1,9 @@
 """The output stage of a module: nothing drives the motor but through `MotorGuard.limit`.
 
-Without a configuration it keeps the duty below the winding's ceiling and the motor below the speed of its
-type, and never drives out of the type's range. A configuration (`control.safety`) narrows these bounds, which
-no gains and no set-point go around, and adds others. Seen at the output, with the motor's speed w and the
-torque tau read from the spring, the upper ones are
+Without a configuration it keeps the duty below the winding's ceiling, the motor below the speed and the
+spring below the torque of its type, and never drives out of the type's range. A configuration
+(`control.safety`) narrows these bounds, which no gains and no set-point go around, and adds others. Seen at
+the output, with the motor's speed w and the torque tau read from the spring, the upper ones are
 
     position, speed   E w1 + S (w1 - w) + L tau     w1: the highest speed at this distance from the limit
     torque, current   E w + R i                     i: the highest current, L times the torque
@@ -41,6 +41,9 @@ STIFFNESS = 3.0
 # The highest speed of a motor over that of its type. The loops clamp their targets at 1.025 times that speed,
 # and overshoot: a healthy joint does not meet this bound.
 OVERSPEED = 1.1
+# The highest torque of the spring over that of its type, to which the loops clamp their targets: what healthy
+# joints overshoot by, and the error of a torque sensor as delivered.
+OVERLOAD = 1.2
 # How fast a joint that is outside of its range is led back [rad/s].
 RETURN_RAD_S = 0.1
 # By how much the push is lowered for every Nm over a torque limit [Nm].
@@ -102,8 +105,8 @@ def bounds_of(kind: ModuleType, limits: Limits, safety: Safety) -> Bounds:
         ceiling_c=safety.winding_c + 1.0,
         min_rad_s=max(safety.velocity_rad_s[0], -OVERSPEED * kind.max_speed_rad_s),
         max_rad_s=min(safety.velocity_rad_s[1], OVERSPEED * kind.max_speed_rad_s),
-        min_nm=safety.effort_nm[0],
-        max_nm=safety.effort_nm[1],
+        min_nm=max(safety.effort_nm[0], -OVERLOAD * kind.max_effort_nm),
+        max_nm=min(safety.effort_nm[1], OVERLOAD * kind.max_effort_nm),
         min_push=max(safety.effort_nm[0] * load_pwm, -current),
         max_push=min(safety.effort_nm[1] * load_pwm, current),
         braking_rad_s2=safety.braking_rad_s2,
@@ -160,7 +163,8 @@ class MotorGuard:
         ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
         # A voltage below zero is no supply to drive with.
         voltage_v = sample.voltage_v if sample.voltage_v > 0.0 else 0.0
-        max_pwm = ceiling * voltage_v / NOMINAL_VOLTAGE_V
+        # Above the nominal voltage, too, a command is at most one.
+        max_pwm = min(ceiling * voltage_v / NOMINAL_VOLTAGE_V, 1.0)
         if -max_pwm <= pwm <= max_pwm:
             return pwm
         self.state |= LimitState.TEMPERATURE if ceiling else LimitState.OVER_TEMPERATURE

@@ -478,6 +478,8 @@ def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callab
             with pytest.raises(MotionInterrupted, match=why):
                 await group.run({BASE: SLOW})
             await asyncio.sleep(0.05)
+            with pytest.raises(MotionInterrupted, match=r"refused: .*; it says: no fresh command for 250 ms"):
+                await group.run({BASE: SLOW})
         assert rig.state(BASE) == "expired"
         await group.acquire()
         assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"

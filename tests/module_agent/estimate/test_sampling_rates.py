@@ -1,5 +1,6 @@
 """Estimates of one joint where rows and IMU samples come at other rates than 250 Hz, or not evenly."""
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -72,3 +73,21 @@ def test_an_imu_that_is_too_slow_is_refused_with_its_rate(horizontal_link: Any) 
     pair = _at(horizontal_link, 30.0, 250.0)[1]
     with pytest.raises(DataError, match=r"the IMU has 30\.0 samples per second; .* at least 35\.7"):
         observed_motions([MotionWindows(*pair, pair[0], 0)])
+
+
+@pytest.mark.parametrize("step_ns", [20, 100_000])
+def test_times_that_would_make_millions_of_samples_are_refused_before_they_do(
+    horizontal_link: Any, step_ns: int
+) -> None:
+    """Most samples of the motion that another module sends lie close together, the others far apart."""
+    imu, joint = horizontal_link._replace(noise=0.0).sine(0.1, 1)
+    steps = np.where(np.arange(joint.t_ns.size) % 5 < 3, step_ns, 40_000_000)
+    hostile = joint._replace(t_ns=joint.t_ns[0] + np.cumsum(steps))
+    carrier = imu._replace(t_ns=imu.t_ns[0] + np.cumsum(steps[: imu.t_ns.size]))
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"samples over .* at most 65536 even ones are made of them"):
+            observed_motions([MotionWindows(imu, hostile, carrier, 0)])
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()

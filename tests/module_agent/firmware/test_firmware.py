@@ -771,6 +771,60 @@ def test_a_clock_that_goes_back_expires_the_command_and_the_lease_at_once(back_m
     assert [o.leaf for o in bench.published].count(Leaf.FEEDBACK) >= 2
 
 
+@pytest.mark.parametrize("step_ns", [0, 1_000, 250_000, 400_000])
+@pytest.mark.parametrize("start_ms", [0, 5_000])
+def test_a_motor_is_off_soon_after_its_commander_died_however_slowly_its_clock_runs(
+    start_ms: int, step_ns: int
+) -> None:
+    bench = Bench()
+    bench.acquire(duration_ns=10_000 * MS)
+    bench.setpoint()
+    assert bench.pwm
+    # A tick adds a millisecond.
+    bench.now = start_ms * MS or -MS
+    if not start_ms:
+        bench.tick()
+        bench.acquire(duration_ns=10_000 * MS)
+        bench.setpoint()
+    driven = 0
+    for k in range(2_000):
+        bench.now += step_ns - MS
+        bench.tick()
+        driven = k + 1 if bench.pwm else driven
+    # At a quarter of its rate its own lifetime takes as long as the clock's fault takes to show.
+    assert driven <= (0 if not step_ns else 4 * 250 + 2)
+    assert bench.firmware.state == "fault" or step_ns == 400_000
+    assert bench.firmware.state != "streaming"
+
+
+def test_a_clock_that_stands_is_a_fault_until_it_runs_again() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.setpoint()
+
+    def stand(ticks: int) -> None:
+        for _ in range(ticks):
+            bench.now -= MS
+            bench.tick()
+
+    stand(1)
+    bench.now -= MS
+    assert bench.status().note == "the module's clock stands"
+    # Nothing is sent over and over, nor is a module armed for longer than a tick.
+    bench.published.clear()
+    stand(3_000)
+    assert len(bench.published) <= 3
+    why = "the module's clock stands, or runs slower than at half its rate"
+    statuses = [decode(Status, one.payload) for one in bench.published if one.leaf is Leaf.STATUS]
+    assert [(status.state, status.note) for status in statuses][-1:] == [("fault", why)]
+    bench.now -= MS
+    refusal = bench.acquire()
+    assert (refusal.accepted, refusal.detail) == (False, why)
+    bench.ticks(498)
+    assert not bench.acquire().accepted
+    assert bench.acquire().accepted
+
+
 @pytest.mark.parametrize(("jump_ms", "state"), [(125, "moving"), (126, "expired"), (240, "expired")])
 def test_a_clock_that_jumps_by_over_half_the_lifetime_expires_the_command_at_once(
     jump_ms: int, state: str

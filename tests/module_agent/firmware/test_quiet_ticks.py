@@ -223,7 +223,8 @@ ACTIONS = st.one_of(
     ),
     st.tuples(st.just("hot"), st.integers(0, 2), st.floats(100.0, 160.0)),
     st.tuples(st.just("fast"), st.integers(0, 2), st.floats(-2.0, 2.0)),
-    st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([-24.0, 0.0, 12.0, 24.0, 48.0])),
+    st.tuples(st.just("voltage"), st.integers(0, 2), st.sampled_from([-24.0, 0.0, 12.0, 24.0, 48.0, 90.0])),
+    st.tuples(st.just("rate"), st.integers(0, 2), st.sampled_from([0.0, 1e-3, 0.4, 1.0])),
     st.tuples(st.just("clock"), st.integers(0, 2), st.sampled_from([-700, -1, 3, 130, 300])),
 )
 
@@ -257,6 +258,8 @@ class Life:
         self._q = np.zeros(3)
         self._winding, self._voltage = [40.0] * 3, [24.0] * 3
         self._fast = [0.0] * 3
+        # How fast the modules' clocks run.
+        self._rate = [1.0] * 3
         self._sick: dict[int, tuple[str, float, int]] = {}
         self._seq = self._motions = 0
 
@@ -269,7 +272,7 @@ class Life:
                 agent.tick(samples)
 
     def _sample(self, k: int) -> SensorSample:
-        self._now[k] += MS + int(self._rng.integers(-20, 20))
+        self._now[k] += int(self._rate[k] * (MS + int(self._rng.integers(-20, 20))))
         if self._tick % 4 == k:
             self._imu[k] = self._now[k]
         random = self._rng.normal(0.0, 0.3, 12).tolist()
@@ -309,6 +312,8 @@ class Life:
             self._fast[k] = rest[1] * kind.gear_ratio * kind.max_speed_rad_s
         elif what == "clock":
             self._now[k] += rest[1] * MS
+        elif what == "rate":
+            self._rate[k] = rest[1]
         else:
             self._tell(k, what, *rest[1:])
         self.ticks(1)
@@ -413,6 +418,37 @@ def test_a_life_in_which_everything_happens_is_the_same_in_both(expiry: str) -> 
         life.act(("acquire", k))
     for action in STEPS:
         life.act(action)
+    assert first_difference(agents) == ""
+
+
+SLOW_CLOCKS: list[tuple[Any, ...]] = [
+    ("ticks", 30),
+    ("rate", 0, 1e-3),
+    ("rate", 1, 0.4),
+    ("rate", 2, 0.0),
+    *(("renew", k) for k in range(3)),
+    ("ticks", 600),
+    *(("acquire", k) for k in range(3)),
+    ("ticks", 600),
+    *(("rate", k, 1.0) for k in range(3)),
+    ("ticks", 600),
+    *(("acquire", k) for k in range(3)),
+    ("ticks", 30),
+]
+
+
+@pytest.mark.parametrize("expiry", ["motor_off", "hold", "damping"])
+def test_clocks_that_stand_or_run_too_slowly_are_found_in_the_same_tick_by_both(expiry: str) -> None:
+    agents = [Agent(is_compiled, 3, expiry, 250.0) for is_compiled in (True, False)]
+    life, states = Life(agents, 4), []
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+    for action in SLOW_CLOCKS:
+        life.act(action)
+        states.append([module.firmware.state for module in agents[0].host.modules])
+    assert states[12] == ["fault", "fault", "fault"]
+    assert states[-1] == ["armed", "armed", "armed"]
     assert first_difference(agents) == ""
 
 

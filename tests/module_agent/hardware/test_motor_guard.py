@@ -18,7 +18,6 @@ from module_agent.hardware.motor_guard import (
     HOLD,
     MARGIN_RAD,
     OFF,
-    OVERSPEED,
     RETURN_RAD_S,
     SPRING,
     STOP,
@@ -222,7 +221,7 @@ def test_at_its_speed_limit_the_motor_gets_what_keeps_its_speed(sign: float) -> 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_without_a_configuration_a_motor_keeps_to_the_speed_of_its_type(sign: float) -> None:
     """Full PWM would drive an X5-9 that carries nothing at 4.8 rad/s, where its type is made for 1.466."""
-    most = OVERSPEED * KIND.max_speed_rad_s
+    most = 1.1 * KIND.max_speed_rad_s
     pwm, state = driven(guard(), sign, reading(speed=sign * most))
     assert pwm == pytest.approx(sign * EMF * most)
     assert state is LimitState.VELOCITY
@@ -233,6 +232,21 @@ def test_without_a_configuration_a_motor_keeps_to_the_speed_of_its_type(sign: fl
     assert driven(guard(), needed, loaded) == (needed, LimitState.NONE)
     # A wider limit than the type's is none.
     assert driven(guard(velocity_rad_s=9.0), sign, reading(speed=sign * most))[0] == pwm
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_configuration_a_spring_keeps_to_the_torque_of_its_type(sign: float) -> None:
+    """Full PWM would make a motor that stands push with more than twice what its type is made for."""
+    most = 1.2 * KIND.max_effort_nm
+    pwm = 0.9 * sign
+    assert driven(guard(), pwm, reading(effort_nm=sign * most)) == (pwm, LimitState.NONE)
+    more = reading(effort_nm=sign * math.nextafter(most, INF))
+    pwm, state = driven(guard(), sign, more)
+    assert pwm == pytest.approx(sign * LOAD * most)
+    assert state is LimitState.EFFORT
+    assert driven(guard(), sign, reading(effort_nm=sign * 1.25 * most))[0] == pytest.approx(0.0, abs=1e-9)
+    # A wider limit than the type's is none.
+    assert driven(guard(effort_nm=99.0), sign, more)[0] == pwm
 
 
 def test_speed_limits_may_differ_by_direction() -> None:
@@ -370,6 +384,7 @@ SIZE = st.sampled_from([0.01, 1.0, 100.0, INF])
     st.tuples(*(st.floats(-1e4, 1e4),) * 5),
     st.floats(-50.0, 400.0),
     st.floats(-100.0, 100.0),
+    st.booleans(),
     st.builds(
         Safety,
         position_rad=st.sampled_from([(-INF, INF), (-0.5, 0.5), (-INF, 0.1), (0.0, 1e-6)]),
@@ -380,12 +395,13 @@ SIZE = st.sampled_from([0.01, 1.0, 100.0, INF])
     ),
 )
 def test_whatever_is_asked_and_read_the_pwm_is_finite_and_below_the_ceiling(
-    pwm: float, values: tuple[float, ...], winding_c: float, voltage_v: float, safety: Safety
+    pwm: float, values: tuple[float, ...], winding_c: float, voltage_v: float, brakes: bool, safety: Safety
 ) -> None:
     limiter = MotorGuard(KIND, catalogue_limits(KIND), safety)
     q, speed, stretch, effort, current = values
     sample = reading(q, speed, stretch, effort_nm=effort, motor_current_a=current)
     sample = sample._replace(winding_temperature_c=winding_c, voltage_v=voltage_v)
-    limited, _ = driven(limiter, pwm, sample)
-    assert abs(limited) <= max(voltage_v, 0.0) / 48.0
+    limiter.watch(sample)
+    limited = limiter.damping(sample) if brakes else limiter.limit(pwm, sample)
+    assert abs(limited) <= min(max(voltage_v, 0.0) / 48.0, 1.0)
     assert not (winding_c >= safety.winding_c and limited)

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from module_agent.hardware.hardware import SensorSample
-from module_agent.hardware.sample_check import MAX_HELD, SampleCheck
+from module_agent.hardware.sample_check import GOOD_PER_BAD, MAX_HELD, MAX_OWED, SampleCheck
 from module_agent.model.catalogue import AMBIENT_C, CATALOGUE
 
 KIND = CATALOGUE["X5-9"]
@@ -78,6 +78,39 @@ def test_the_sixth_bad_sample_in_a_row_is_a_fault_and_a_good_one_ends_it() -> No
         check.checked(GOOD)
         assert check.fault == ""
     assert MAX_HELD == 5
+
+
+@pytest.mark.parametrize("good", [1, 3, 6])
+def test_a_sensor_that_is_bad_time_and_again_is_a_fault_until_it_is_good_for_a_while(good: int) -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    bad, said = GOOD._replace(effort_nm=math.nan), []
+    for _ in range(1000):
+        check.checked(bad)
+        for _ in range(good):
+            check.checked(GOOD)
+            said.append(check.fault)
+    first = said.index(f"effort_nm reads nan, possible are -{MOST['effort_nm']:g} .. {MOST['effort_nm']:g}")
+    assert 1 + first // good >= MAX_OWED // GOOD_PER_BAD
+    # From then on it is not well for a moment.
+    assert "" not in said[first:]
+    for _ in range(MAX_OWED - good):
+        assert check.fault
+        check.checked(GOOD)
+    assert check.fault == ""
+
+
+def test_a_bad_sample_now_and_then_is_none() -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    bad = GOOD._replace(effort_nm=math.nan)
+    for _ in range(1000):
+        check.checked(bad)
+        assert check.fault == ""
+        for _ in range(GOOD_PER_BAD):
+            assert not check.is_clean
+            check.checked(GOOD)
+        assert check.is_clean
 
 
 def test_before_a_good_sample_a_bad_one_is_a_fault_at_once_and_reads_as_at_rest() -> None:
