@@ -11,6 +11,7 @@ from coordinator.recording.recording import Recording
 from module_agent.model.errors import RobotError
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ack, LeaseRequest, Message
+from module_agent.wire.proof import secret_for
 from module_agent.wire.refusal import Refusal
 
 POLL_S = 0.02
@@ -52,6 +53,7 @@ class Commander:
     ):
         self.boots: dict[str, int] = {}
         self.sender, self._secret = sender
+        self._secrets: dict[str, bytes] = {}
         self._messenger = messenger
         self._recording = recording
         self._clock = clock
@@ -83,7 +85,7 @@ class Commander:
 
     def publish(self, serial: str, leaf: Leaf, command: Message) -> None:
         """Send a command that is not acknowledged, with the proof that it is this sender's."""
-        self._messenger.publish(serial, leaf, command, self._secret)
+        self._messenger.publish(serial, leaf, command, self._secret_for(serial))
 
     async def achieve(self, serial: str, leaf: Leaf, make: Make) -> Ack:
         """Send commands until one is acknowledged."""
@@ -116,12 +118,17 @@ class Commander:
 
     async def _commanded(self, serial: str, leaf: Leaf, command: Message, timeout_s: float = 0.5) -> Ack:
         """Send a command with the proof that it is this sender's, and wait for its acknowledgement."""
-        return await self._messenger.command(serial, leaf, command, timeout_s, self._secret)
+        return await self._messenger.command(serial, leaf, command, timeout_s, self._secret_for(serial))
 
     def _lease(self, serial: str, action: str) -> LeaseRequest:
         # No other program hears an acquisition; renewals are proven like every other command.
-        secret = self._secret if action == "acquire" else b""
+        secret = self._secret_for(serial) if action == "acquire" else b""
         return self.command(LeaseRequest, serial, action=action, duration_ns=LEASE_NS, secret=secret)
+
+    def _secret_for(self, serial: str) -> bytes:
+        if serial not in self._secrets:
+            self._secrets[serial] = secret_for(serial, self._secret)
+        return self._secrets[serial]
 
     # ------------------------------------------------------------------ leases
 

@@ -3,8 +3,8 @@
 Who acquires a lease sends a secret with the request; every later command of that holder ends with
 HMAC-SHA-256(secret, command), its first 16 bytes (RFC 2104, truncated as its section 5 allows), as one more
 msgpack object behind the command's map. What modules publish does not contain the secret, so a program
-that only listens cannot act in the holder's name; replays are refused by sequence number and age. Who reads
-the link to the module reads the secret too: against that helps TLS.
+that only listens cannot act in the holder's name; replays are refused by sequence number and age. Every
+module is given a secret of its own. Who reads the link to one reads that one's, against which TLS helps.
 """
 
 import hmac
@@ -14,6 +14,11 @@ _PROOF_BYTES = 16
 # A msgpack binary of 16 bytes.
 _HEAD = b"\xc4\x10"
 _END_BYTES = len(_HEAD) + _PROOF_BYTES
+
+
+def secret_for(serial: str, secret: bytes) -> bytes:
+    """Return what a program with a secret gives a module; it tells nothing of what others are given."""
+    return hmac.digest(secret, serial.encode(), "sha256")[:SECRET_BYTES] if secret else b""
 
 
 def proven(command: bytes, secret: bytes) -> bytes:

@@ -26,7 +26,7 @@ from module_agent.wire.messages import (
     Setpoint,
     Status,
 )
-from module_agent.wire.proof import proven
+from module_agent.wire.proof import proven, secret_for
 from module_agent.wire.refusal import WireError
 
 # The coordinator has numbered less: a copy of its commands and these are told apart.
@@ -58,6 +58,7 @@ class RecklessHolder:
         self._transport = transport
         self._target = target
         self._sender = sender
+        self._secret = secret_for(target.serial, sender.secret)
         manner, part = divmod(size * len(MANNERS), 1.0)
         self._manner = MANNERS[int(manner)]
         self._turn = 1.0 if part < 0.5 else -1.0
@@ -115,7 +116,7 @@ class RecklessHolder:
             echo_ns=self._newest_ns,
             action="acquire",
             duration_ns=_LEASE_NS,
-            secret=self._sender.secret,
+            secret=self._secret,
         )
         at = key(self._target.robot, self._target.serial, Leaf.LEASE)
         self._transport.query(at, encode(request), 0.5, lambda event: None, self._seq)
@@ -150,7 +151,7 @@ class RecklessHolder:
         self._seq += 1
 
     def _proven(self, command: Message) -> bytes:
-        return proven(encode(command), self._sender.secret)
+        return proven(encode(command), self._secret)
 
 
 MANNERS: tuple[Callable[[RecklessHolder, float], None], ...] = (

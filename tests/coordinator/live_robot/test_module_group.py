@@ -14,9 +14,19 @@ from coordinator.live_robot.module_group import ModuleGroup
 from module_agent.control.motion import effort_profile
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.transport.transport import TransportError
+from module_agent.wire.codec import decode
 from module_agent.wire.keys import Leaf, parse
-from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest, Setpoint
-from tests.rig import silent
+from module_agent.wire.messages import (
+    Ack,
+    ConstantMotion,
+    GoTo,
+    LeaseRequest,
+    Message,
+    MotionCommand,
+    Rest,
+    Setpoint,
+)
+from tests.rig import SECRET, silent
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -302,6 +312,29 @@ def test_a_module_that_another_holds_now_is_not_stopped_with_the_others(rigs: Ca
         assert [rig.state(serial) for serial in (BASE, TIP)] == ["armed", "stopped"]
 
     rig.run(work())
+
+
+def test_every_module_is_given_a_secret_of_its_own(rigs: Callable[..., Any]) -> None:
+    """Who serves one module's lease key, and so reads its secret, commands no other in the holder's name."""
+    given: dict[str, set[bytes]] = {BASE: set(), TIP: set()}
+
+    def tap(_now_ns: int, _endpoint: str, kind: str, at: str, payload: bytes) -> None:
+        if kind == "request" and parse(at).leaf is Leaf.LEASE:
+            given[parse(at).serial].add(decode(LeaseRequest, payload).secret)
+
+    rig = rigs(ARM, tap=tap)
+    _, _, group = rig.group()
+
+    async def work() -> None:
+        await _armed(group)
+        await group.run({BASE: Rest(duration_s=0.2)})
+
+    rig.run(work())
+    # Renewals have none, but the proof.
+    base, tip = (given[serial] - {b""} for serial in (BASE, TIP))
+    assert (len(base), len(tip)) == (1, 1)
+    assert base != tip
+    assert SECRET not in base | tip
 
 
 def test_one_renewal_that_cannot_be_sent_does_not_end_those_of_the_others(

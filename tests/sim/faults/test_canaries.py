@@ -39,8 +39,8 @@ FROZEN = 289
 STOLEN = 81
 # Messages are corrupted while joints move.
 CORRUPTED = 10
-# A program with the holder's secret swings a joint at twice the speed of its type.
-RECKLESS = 68
+# A program with the holder's secret drives a joint by its whole voltage.
+RECKLESS = 57
 # Something holds a motor while its joint is to move, and lets it go.
 HELD = 39
 # A motor is too hot while the session begins.
