@@ -16,7 +16,8 @@ import pytest
 
 from coordinator.recording.run_folder import RESULT, SESSION, load_recording
 from module_agent.model.errors import EXIT_FAILED, EXIT_LOST
-from sim.processes.launcher import Child, Launcher
+from sim.processes.launcher import LOGS, Child, Launcher
+from sim.scoring.score import score
 from tests.integration.conftest import MARK, marked_processes
 
 KILLS, SPEED = int(os.environ.get("X5_KILLS", "2")), float(os.environ.get("X5_KILLS_SPEED", "1.0"))
@@ -73,6 +74,25 @@ def check_end(robot: Launcher, ended: Child, said: str, killed: Child) -> None:
         assert killed.name == "world" or all(killed.name == f"agent {serial}" for serial in lost), said
 
 
+def check_robot(robot: Launcher) -> None:
+    """Check that the result is the true robot, and that no process has died of a defect."""
+    found = score(robot.config.out)
+    assert found.topology_correct, found.topology_differences
+    (link,) = found.links
+    assert link.link_length_error_mm is not None
+    assert link.link_length_sigma_mm is not None
+    # Within the claim, and no claim that says nothing.
+    assert (
+        abs(link.link_length_error_mm) <= 5.0 * link.link_length_sigma_mm <= 0.05 * link.link_length_true_mm
+    )
+    check_logs(robot)
+
+
+def check_logs(robot: Launcher) -> None:
+    for log in (robot.config.out / LOGS).iterdir():
+        assert "Traceback" not in log.read_text(errors="replace"), log
+
+
 @pytest.mark.parametrize("seed", range(KILLS))
 def test_a_random_kill_has_a_named_end_and_the_run_resumes(
     launcher, programs, nothing_is_left, tmp_path, seed: int
@@ -84,7 +104,7 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
     if which == "launcher":
         launched = launch(robot, tmp_path / "launch.log")
         kill_at(launched, launched, session, after_s)
-        check_end(robot, launched, "", killed=launched)
+        check_end(robot, launched, (tmp_path / "launch.log").read_text(), killed=launched)
         programs.until(lambda: not living(), "the end of all that it had launched")
         # Only who is killed outright leaves the folder of its bus.
         for folder in nothing_is_left.glob("x5-*"):
@@ -112,7 +132,11 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
     assert recording.damage == []
     robot.stop()
     assert all(child.process.poll() is not None for child in robot.children)
-    if (robot.config.out / "result.json").exists():
+    check_logs(robot)
+    if (robot.config.out / RESULT).exists():
+        # A world that was killed leaves no truth to compare with.
+        if which != "world":
+            check_robot(robot)
         return
 
     # The same robot again; what has been done is not repeated.
@@ -131,3 +155,4 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
     before, after = (sum(e.what == "session" for e in each.journal) for each in (recording, whole))
     assert after == before + 1
     assert done <= {event.step for event in whole.journal if event.what == "done"}
+    check_robot(again)
