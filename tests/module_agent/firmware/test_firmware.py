@@ -1,5 +1,6 @@
 """A module obeys one holder, refuses what is late or wrong and says so, and never moves on its own."""
 
+import itertools
 import math
 from collections.abc import Callable
 from itertools import pairwise
@@ -652,6 +653,59 @@ def test_no_sequence_of_commands_drives_a_motor_that_is_not_commanded(actions: l
         bench.tick()
         if bench.firmware.state not in COMMANDED:
             assert bench.pwm == 0.0
+
+
+# What every command and event makes of every state; "-" is a refusal.
+AFTERWARDS = """
+           acquire  release  move    setpoint   stop     hot    wait
+idle       armed    -        -       -          stopped  fault  idle
+armed      armed    idle     moving  streaming  stopped  fault  expired
+moving     armed    idle     -       -          stopped  fault  expired
+streaming  armed    idle     moving  streaming  stopped  fault  expired
+expired    armed    expired  -       -          stopped  fault  expired
+stopped    armed    stopped  -       -          stopped  fault  stopped
+fault      armed    fault    -       -          fault    fault  fault
+"""
+EVENTS, *STATES = [line.split() for line in AFTERWARDS.strip().splitlines()]
+WAYS: dict[str, tuple[str, ...]] = {
+    "idle": (),
+    "armed": ("acquire",),
+    "moving": ("acquire", "move"),
+    "streaming": ("acquire", "setpoint"),
+    "expired": ("acquire", "wait"),
+    "stopped": ("acquire", "stop"),
+    "fault": ("acquire", "hot"),
+}
+
+
+@pytest.mark.parametrize(
+    ("state", "action", "after"),
+    [(state, action, after) for state, *row in STATES for action, after in zip(EVENTS, row, strict=True)],
+)
+def test_what_a_module_does_in_each_state_with_each_command(state: str, action: str, after: str) -> None:
+    bench, numbers = Bench(), itertools.count(1)
+    does: dict[str, Callable[[], Ack | None]] = {
+        "acquire": lambda: bench.acquire(duration_ns=10_000 * MS),
+        "release": lambda: bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))),
+        "move": lambda: bench.move(next(numbers)),
+        "setpoint": bench.setpoint,
+        "stop": lambda: bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="anybody")),
+        "hot": lambda: heat(155.0),
+        "wait": lambda: bench.ticks(255),
+    }
+
+    def heat(winding_c: float) -> None:
+        bench.winding_c = winding_c
+        bench.tick()
+
+    for one in WAYS[state]:
+        does[one]()
+    heat(40.0)
+    assert bench.firmware.state == state
+    answer = does[action]()
+    assert bench.firmware.state == (state if after == "-" else after)
+    if answer is not None:
+        assert answer.accepted == (after != "-")
 
 
 def test_every_transition_leads_to_a_state_that_can_be_left_again() -> None:

@@ -63,11 +63,11 @@ def test_in_the_middle_of_a_wide_range_nothing_is_bounded() -> None:
 def test_towards_a_limit_the_motor_may_be_as_fast_as_it_can_stop(sign: float, action: str) -> None:
     """0.3 rad before where it aims, 5 rad/s^2 stop from sqrt(2 a (d - d0 / 2)), where d0 = a / (5 1/s)^2."""
     limiter = guard(position_rad=RANGE, at_limit=action)
-    sample = reading(q=sign * (0.5 - MARGIN_RAD - 0.3), speed=sign)
+    sample = reading(q=sign * (0.5 - 0.02 - 0.3), speed=sign)
     speed = math.sqrt(2.0 * 5.0 * (0.3 - 0.1))
     pwm, state = driven(limiter, sign, sample)
     assert pwm == pytest.approx(sign * (EMF * speed + 3.0 * EMF * (speed - 1.0)))
-    near = reading(q=sign * (0.5 - MARGIN_RAD - 0.1))
+    near = reading(q=sign * (0.5 - 0.02 - 0.1))
     pwm, state = driven(limiter, sign, near)
     assert pwm == pytest.approx(sign * 4.0 * EMF * APPROACH_PER_S * 0.1)
     assert state is LimitState.POSITION
