@@ -98,6 +98,7 @@ def test_a_sensor_that_is_bad_time_and_again_is_a_fault_until_it_is_good_for_a_w
         assert check.fault
         check.checked(GOOD)
     assert check.fault == ""
+    assert (GOOD_PER_BAD, MAX_OWED) == (8, 200)
 
 
 def test_a_bad_sample_now_and_then_is_none() -> None:
