@@ -25,8 +25,6 @@ from module_agent.hardware.hardware import LimitState, SensorSample
 from module_agent.model.catalogue import ModuleType
 from module_agent.wire.messages import Limits
 
-# The manufacturer's PWM ceiling is 1 - 1/(155 - T), which has fallen to zero at 154 C.
-CEILING_LIMIT_C = MAX_WINDING_C + 1.0
 DAMPING_LIMIT_PWM = 0.25
 # What a side of the range does: nothing; PWM of zero outward, which is the type's own; and those configured.
 FREE, STOP, OFF, HOLD, SPRING = range(5)

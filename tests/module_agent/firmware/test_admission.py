@@ -8,7 +8,7 @@ from module_agent.firmware.admission import NEVER_NS, SENDERS_REMEMBERED, Admiss
 from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ask, LeaseRequest, Setpoint, Stop
-from module_agent.wire.proof import proven
+from module_agent.wire.proof import SECRET_BYTES, proven, secret_for
 from module_agent.wire.refusal import Refusal, WireError
 
 MS = 1_000_000
@@ -293,3 +293,12 @@ def test_a_command_is_as_old_as_what_its_sender_knew(age_ns: int, words: str) ->
     with pytest.raises(WireError, match=words) as error:
         checks.check_command(setpoint(seq=LIFETIME_NS + 1, echo_ns=now_ns - age_ns), b"", lease, now_ns)
     assert reason(error) is Refusal.STALE
+
+
+def test_what_one_module_is_given_tells_nothing_of_what_another_is() -> None:
+    own, other = (secret_for(serial, b"a-secret-of-16-b") for serial in ("A", "B"))
+    assert own != other
+    assert len(own) == len(other) == SECRET_BYTES
+    assert own == secret_for("A", b"a-secret-of-16-b") != secret_for("A", b"a-guess-of-16-b!")
+    # A program without a secret proves nothing.
+    assert secret_for("A", b"") == b""
