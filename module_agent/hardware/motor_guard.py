@@ -20,7 +20,7 @@ import math
 from typing import NamedTuple
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V
-from module_agent.control.safety import MAX_WINDING_C, UNCONFIGURED, LimitAction, Safety
+from module_agent.control.safety import UNCONFIGURED, LimitAction, Safety
 from module_agent.hardware.hardware import LimitState, SensorSample
 from module_agent.model.catalogue import ModuleType
 from module_agent.wire.messages import Limits
