@@ -19,6 +19,7 @@ import pytest
 import typer
 
 from coordinator.attendant.workspace import load_workspace
+from coordinator.excitation.plan import Plan
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.topics import TOPICS
 from sim.benchmark.cases.suites import (
@@ -298,6 +299,21 @@ def test_the_workspace_of_the_guide_is_one(tmp_path: Path) -> None:
     workspace = load_workspace(path)
     assert workspace.range_rad("elbow") == (-0.8, 1.0)
     assert workspace.tool_m == 0.1
+
+
+def test_the_guide_has_every_setting_of_a_plan_with_its_default() -> None:
+    part = PAGES["guide.md"].partition("`--plan FILE`")[2].partition("When it is in doubt")[0]
+    told: dict[str, object] = {}
+    for names, defaults in re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| (.*?) \|", part, flags=re.MULTILINE):
+        keys, values = re.findall(r"`(\w+)`", names), defaults.split(", ")
+        # One for all, or each its own.
+        told |= {name: values[min(k, len(values) - 1)].strip("`") for k, name in enumerate(keys)}
+    assert told.keys() == Plan.model_fields.keys()
+    for name, value in Plan():
+        if value is None:
+            assert str(told[name]).startswith(("none", "by "))
+        else:
+            assert json.loads(str(told[name])) == value, name
 
 
 def test_the_wire_page_has_every_topic_with_its_messages() -> None:

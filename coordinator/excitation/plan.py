@@ -37,7 +37,7 @@ class Plan(BaseModel):
     simultaneous_duration_s: Seconds | None = None
     discover_s: Seconds = 1.0
     link_s: Seconds = 1.0
-    home_rad: float = 0.0
+    home_rad: Annotated[float, Field(ge=-6.2832, le=6.2832)] = 0.0
     travel_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
     # Before anything else the robot goes home, and every joint a little to either side, no faster than this;
     # a joint that is blocked ends the session. None for no such trial.

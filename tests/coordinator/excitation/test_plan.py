@@ -65,7 +65,14 @@ def test_exploring_gains_stiffen_the_position_loop_alone() -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("rest_s", 0.0), ("rest_s", float("nan")), ("sine_frequency_hz", -2.0), ("retries", 6), ("colour", 1)],
+    [
+        ("rest_s", 0.0),
+        ("rest_s", float("nan")),
+        ("sine_frequency_hz", -2.0),
+        ("retries", 6),
+        ("colour", 1),
+        ("home_rad", 99.0),
+    ],
 )
 def test_impossible_plans_are_refused_by_field(field: str, value: float) -> None:
     with pytest.raises(ValidationError, match=field):
