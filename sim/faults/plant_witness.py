@@ -11,7 +11,7 @@ import numpy as np
 
 from module_agent.control.safety import UNCONFIGURED
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
-from module_agent.model.catalogue import module_type
+from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.wire.codec import decode
 from module_agent.wire.keys import KeyParts, Leaf, parse
 from module_agent.wire.messages import Ack, LeaseRequest
@@ -86,7 +86,8 @@ class PlantWitness:
         self._hot_ticks: dict[str, int] = {}
         self._sent_ns: dict[str, int] = {}
         self._accepted_ns: dict[str, int] = {}
-        self._stopped: set[str] = set()
+        # When modules accepted a stop that no acquisition has ended since.
+        self._stopped_ns: dict[str, int] = {}
         self._requests: dict[tuple[str, str, int], _Request] = {}
         self._leases: dict[str, _Held] = {}
         self._usual: _Usual | None = None
@@ -117,7 +118,7 @@ class PlantWitness:
         if not ack.accepted:
             return
         if parts.leaf is Leaf.STOP:
-            self._stopped.add(parts.serial)
+            self._stopped_ns.setdefault(parts.serial, now_ns)
             return
         self._accepted_ns[parts.serial] = now_ns
         if parts.leaf is not Leaf.LEASE:
@@ -129,7 +130,7 @@ class PlantWitness:
         asker, acquires = self._requests.get((parts.serial, ack.holder, ack.re), _Request("?", True))
         if acquires:
             # Nothing else ends a stop. A keep-alive of a motion that is done is accepted after it, too.
-            self._stopped.discard(parts.serial)
+            self._stopped_ns.pop(parts.serial, None)
         if held is not None and held.boot == ack.boot and now_ns < held.until_ns and held.by != asker:
             self._note("two holders", f"module {parts.serial} is held by {held.by} and obeys {asker}")
         self._leases[parts.serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns)
@@ -160,17 +161,12 @@ class PlantWitness:
         elif any(self._outward_rad.values()):
             self._outward_rad = dict.fromkeys(self._ranges, 0.0)
         self._check_heat(robot, seen[:, PLANT_PWM])
-        for k, serial in enumerate(robot.serials):
-            commanded_ns = min(
-                self._sent_ns.get(serial, -LIFETIME_NS), self._accepted_ns.get(serial, -LIFETIME_NS)
-            )
-            ended_ns = commanded_ns + LIFETIME_NS
-            # The first tick that is later than by two.
-            late = max((ended_ns - first_ns) // TICK_NS + 3, 0)
-            if late < len(seen) and seen[late:, PLANT_PWM, k].any():
-                rows = seen[late:, (PLANT_PWM, PLANT_MOTOR_RAD_S), k].tolist()
-                for tick, (pwm, speed) in enumerate(rows, late):
-                    self._check_off(serial, first_ns + tick * TICK_NS, ended_ns, pwm, speed)
+        for k, module in enumerate(robot.robot.modules):
+            driven = seen[:, (PLANT_PWM, PLANT_MOTOR_RAD_S), k]
+            if module.serial in self._stopped_ns:
+                self._check_stopped(module.serial, module_type(module.type), first_ns, driven)
+            else:
+                self._check_late(module.serial, first_ns, driven[:, 0])
 
     def _usual_of(self, robot: VirtualRobot) -> "_Usual":
         """Return what no check finds anything in."""
@@ -252,16 +248,42 @@ class PlantWitness:
                 )
                 self._note("driven beyond its range", text)
 
-    def _check_off(self, serial: str, t_ns: int, ended_ns: int, pwm: float, speed: float) -> None:
-        """Judge a motor that is commanded no more: off, or braking after a stop."""
-        # The brake follows the motor's speed, which a spring keeps apart from the output's.
-        if pwm == 0.0:
+    def _check_late(self, serial: str, first_ns: int, pwm: Array) -> None:
+        """Judge a motor, PWM (T,), after the lifetime of what it was commanded last: it is off."""
+        sent_ns, accepted_ns = (of.get(serial, -LIFETIME_NS) for of in (self._sent_ns, self._accepted_ns))
+        ended_ns = min(sent_ns, accepted_ns) + LIFETIME_NS
+        # The first tick that is later than by two.
+        late = max((ended_ns - first_ns) // TICK_NS + 3, 0)
+        if late >= len(pwm) or not pwm[late:].any():
             return
-        brakes = abs(pwm) <= DAMPING_LIMIT_PWM and (abs(speed) < SLOW_RAD_S or pwm * speed <= 0.0)
-        if serial not in self._stopped or not brakes:
-            where = f"module {serial} at {t_ns / 1e9:.3f} s: PWM {pwm:.3f}"
-            late_ms = (t_ns - ended_ns) / 1e6
-            self._note("driven too late", f"{where}, {late_ms:.0f} ms after its lifetime ended")
+        tick = late + int(np.argmax(pwm[late:] != 0.0))
+        t_ns = first_ns + tick * TICK_NS
+        text = f"PWM {pwm[tick]:.3f}, {(t_ns - ended_ns) / 1e6:.0f} ms after its lifetime ended"
+        self._note("driven too late", f"module {serial} at {t_ns / 1e9:.3f} s: {text}")
+
+    def _check_stopped(self, serial: str, kind: ModuleType, first_ns: int, driven: Array) -> None:
+        """Judge a motor, PWM and speed (T, 2), from two ticks after a stop on: it is off, or it brakes.
+
+        The brake follows the motor's speed, which a spring keeps apart from the output's. Before a limit of
+        its position it is harder than elsewhere, and never harder than what the speed alone would induce.
+        """
+        stopped_ns = self._stopped_ns[serial]
+        begin = max((stopped_ns - first_ns) // TICK_NS + 2, 0)
+        if begin >= len(driven) or not driven[begin:, 0].any():
+            return
+        pwm, speed = driven[begin:].T
+        hardest = np.maximum(DAMPING_LIMIT_PWM, SPEED_MARGIN * np.abs(speed) / kind.max_speed_rad_s)
+        brakes = (np.abs(pwm) <= hardest) & ((np.abs(speed) < SLOW_RAD_S) | (pwm * speed <= 0.0))
+        wrong = (pwm != 0.0) & ~brakes
+        if not wrong.any():
+            return
+        tick = int(np.argmax(wrong))
+        t_ns = first_ns + (begin + tick) * TICK_NS
+        text = (
+            f"PWM {pwm[tick]:.3f} at {speed[tick]:.2f} rad/s, {(t_ns - stopped_ns) / 1e6:.0f} ms after it "
+            "accepted a stop"
+        )
+        self._note("driven after a stop", f"module {serial} at {t_ns / 1e9:.3f} s: {text}")
 
     def _note(self, kind: str, text: str) -> None:
         self.violations.setdefault(kind, text)

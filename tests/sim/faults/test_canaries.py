@@ -39,8 +39,10 @@ FROZEN = 289
 STOLEN = 81
 # Messages are corrupted while joints move.
 CORRUPTED = 10
-# A program with the holder's secret drives a joint by its whole voltage.
+# A program with the holder's secret drives a joint by full PWM.
 RECKLESS = 57
+# Another swings one at twice the speed of its type, until the coordinator notices and stops the robot.
+STOPPED = 68
 # Something holds a motor while its joint is to move, and lets it go.
 HELD = 39
 # A motor is too hot while the session begins.
@@ -51,7 +53,7 @@ HARMLESS = 102
 HARMLESS_HANGING = 7
 
 
-@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS, HOT, HARMLESS, HARMLESS_HANGING])
+@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS, STOPPED, HOT, HARMLESS, HARMLESS_HANGING])
 def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
     assert found(seed) == {}
 
@@ -69,6 +71,11 @@ def test_firmware_that_does_not_expire_drives_too_late(monkeypatch: pytest.Monke
     monkeypatch.setattr(Firmware, "_expire", lambda firmware: None)
     monkeypatch.setattr("module_agent.firmware.firmware.Lease.lapsed", lambda lease, now_ns: False)
     assert set(found(KILLED)) == {"driven too late"}
+
+
+def test_a_module_that_ignores_stops_drives_after_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Firmware, "_stop", lambda firmware, note: None)
+    assert set(found(STOPPED)) == {"driven after a stop"}
 
 
 def test_a_guard_that_does_not_limit_lets_too_much_pwm_out(monkeypatch: pytest.MonkeyPatch) -> None:

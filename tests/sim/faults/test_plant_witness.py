@@ -62,7 +62,7 @@ class Scene:
         robot: Any = SimpleNamespace(
             serials=(SERIAL,),
             world=SimpleNamespace(t_ns=from_ns + len(seen) * MS, winding_c=np.array([self.winding_c])),
-            robot=SimpleNamespace(modules=[SimpleNamespace(type="X5-9")]),
+            robot=SimpleNamespace(modules=[SimpleNamespace(serial=SERIAL, type="X5-9")]),
         )
         self.witness.check(robot, seen)
         return set(self.witness.violations)
@@ -86,7 +86,7 @@ def test_a_keep_alive_that_a_stop_has_overtaken_does_not_end_the_stop(leaf: Leaf
     scene.accept(Leaf.STOP)
     scene.accept(leaf, action)
     assert scene.judged(pwm=0.018, speed_rad_s=-0.5) == set()
-    assert scene.judged(pwm=0.018, speed_rad_s=+0.5) == {"driven too late"}
+    assert scene.judged(pwm=0.018, speed_rad_s=+0.5) == {"driven after a stop"}
 
 
 def test_a_module_that_was_armed_after_a_stop_is_stopped_no_more() -> None:
@@ -94,6 +94,49 @@ def test_a_module_that_was_armed_after_a_stop_is_stopped_no_more() -> None:
     scene.accept(Leaf.STOP)
     scene.accept(Leaf.LEASE, "acquire")
     assert scene.judged(pwm=0.018, speed_rad_s=-0.5) == {"driven too late"}
+
+
+def test_a_module_that_has_accepted_a_stop_brakes_from_two_ticks_after_it() -> None:
+    """Long before the lifetime of the command that the stop ended."""
+    seen = np.zeros((8, SEEN_ROWS, 1))
+    for last, found in ((1, set()), (2, {"driven after a stop"})):
+        scene = armed()
+        scene.accept(Leaf.STOP)
+        seen[: last + 1, PLANT_PWM] = 0.2
+        seen[:, PLANT_MOTOR_RAD_S] = 0.5
+        assert scene.looked(seen, scene.now_ns) == found
+
+
+def test_a_second_stop_gives_no_more_time_to_brake() -> None:
+    scene = armed()
+    for _ in range(2):
+        scene.accept(Leaf.STOP)
+    seen = np.zeros((2, SEEN_ROWS, 1))
+    seen[:, PLANT_PWM], seen[:, PLANT_MOTOR_RAD_S] = 0.2, 0.5
+    assert scene.looked(seen, scene.now_ns) == {"driven after a stop"}
+
+
+@pytest.mark.parametrize(
+    ("pwm", "speed_rad_s", "kinds"),
+    [
+        (-0.25, 0.5, set()),
+        # Slower than the speed's own noise on a spring there is no direction to oppose.
+        (0.25, 0.04, set()),
+        # Before a limit of its position a fast joint is braked harder; 1.466 rad/s are an X5-9's most.
+        (-0.8, 1.2, set()),
+        (-0.8, 0.5, {"driven after a stop"}),
+        (0.2, 1.2, {"driven after a stop"}),
+        (0.5, 0.0, {"driven after a stop"}),
+    ],
+)
+def test_a_stopped_motor_is_off_or_opposes_its_motion(
+    pwm: float, speed_rad_s: float, kinds: set[str]
+) -> None:
+    scene = armed()
+    scene.accept(Leaf.STOP)
+    seen = np.zeros((4, SEEN_ROWS, 1))
+    seen[:, PLANT_PWM], seen[:, PLANT_MOTOR_RAD_S] = pwm, speed_rad_s
+    assert scene.looked(seen, scene.now_ns + 10 * MS) == kinds
 
 
 @pytest.mark.parametrize(
