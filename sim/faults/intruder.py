@@ -7,17 +7,25 @@ of security.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import msgpack
 import numpy as np
 
 from module_agent.transport.transport import Event, Sample, Transport
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import ROOT, Leaf, key
-from module_agent.wire.messages import SCHEMA_VERSION
+from module_agent.wire.messages import SCHEMA_VERSION, Feedback
+from module_agent.wire.refusal import WireError
 
 OVERHEARD = (Leaf.LEASE, Leaf.MOTION, Leaf.SETPOINT, Leaf.GAINS)
 HUGE = 2**62
+# Coordinators, and programs with their secret, number less: answers tell whose command they are about.
+_FIRST_SEQ = 2_000_000
+# From where a joint is to where it is told to go: every module's range has room for it on one side at least.
+ASIDE_RAD, SPEED_RAD_S = 0.3, 0.5
 # Copies of commands: of the newest so many.
 _REMEMBERED = 16
 
@@ -37,10 +45,14 @@ class Intruder:
         self._attack = ATTACKS[attack]
         self._rng = np.random.default_rng(seed)
         self._status: dict[str, Any] = {}
+        # The newest time that the module tells, and where its joint was: None before it was heard.
+        self._seen: tuple[int, float] | None = None
         self._overheard: list[tuple[Leaf, bytes]] = []
         self._sent = 0
+        self._aside_rad = ASIDE_RAD
         self._declared = False
         transport.subscribe(key(robot, serial, Leaf.STATUS), self._hear)
+        transport.subscribe(key(robot, serial, Leaf.FEEDBACK), self._hear_rows)
 
     def overhear(self, leaf: Leaf, payload: bytes) -> None:
         """Take note of a command to the module."""
@@ -63,6 +75,12 @@ class Intruder:
             if isinstance(heard, dict) and heard.get("serial") == self._serial:
                 self._status = heard
 
+    def _hear_rows(self, event: Event) -> None:
+        if isinstance(event, Sample):
+            with suppress(WireError):
+                newest = unpack(decode(Feedback, event.payload, MAX_MESSAGE_BYTES))[-1]
+                self._seen = int(newest["t_ns"]), float(newest["position_rad"])
+
     def _publish(self, at: str, message: dict[str, Any]) -> None:
         self._transport.publish(at, msgpack.packb(message))
 
@@ -81,25 +99,37 @@ class Intruder:
         self._publish(f"{ROOT}/{self._robot}/-bad/{Leaf.STATUS.value}", self._status | {"serial": "-bad"})
 
     def impersonate(self) -> None:
-        """Command in the holder's name, as a module publishes it."""
-        status = self._status
-        if not status.get("holder"):
+        """Command in the holder's name, as a module publishes it, what the module's limits allow.
+
+        Of a lease, a motion and a set-point each: with the token that the module publishes, and without.
+        """
+        status, seen = self._status, self._seen
+        if not status.get("holder") or seen is None:
             return
-        self._sent += 1
-        head = {
+        echo_ns, position_rad = seen
+        self._aside_rad = -self._aside_rad
+        target_rad = position_rad + self._aside_rad
+        for token in (status["token"], 0):
+            aims = {"position_rad": target_rad, "velocity_rad_s": None, "effort_nm": None}
+            path = {"kind": "goto", "target_rad": target_rad, "max_speed_rad_s": SPEED_RAD_S}
+            motion = {"motion_id": _FIRST_SEQ + self._sent, "pattern": path}
+            lease = {"duration_ns": 1_000_000_000, "secret": b"a-guess-of-16-b!"}
+            self._publish(key(self._robot, self._serial, Leaf.SETPOINT), self._head(token, echo_ns) | aims)
+            self._ask(Leaf.MOTION, msgpack.packb(self._head(token, echo_ns) | motion))
+            for action in ("acquire", "renew", "release"):
+                self._ask(Leaf.LEASE, msgpack.packb(self._head(token, echo_ns) | lease | {"action": action}))
+
+    def _head(self, token: int, echo_ns: int) -> dict[str, Any]:
+        """Return what every command in the holder's name begins with."""
+        return {
             "v": SCHEMA_VERSION,
             "serial": self._serial,
-            "boot": status["boot"],
-            "seq": 1_000_000 + self._sent,
-            "sender": status["holder"],
-            "token": status["token"],
-            "echo_ns": status["t_ns"],
+            "boot": self._status["boot"],
+            "seq": _FIRST_SEQ + self._sent,
+            "sender": self._status["holder"],
+            "token": token,
+            "echo_ns": echo_ns,
         }
-        lease = {"duration_ns": 1_000_000_000, "secret": b"a-guess-of-16-b!"}
-        for action in ("acquire", "renew", "release"):
-            self._ask(Leaf.LEASE, msgpack.packb(head | lease | {"action": action}))
-        aims = {"position_rad": 3.0, "velocity_rad_s": None, "effort_nm": None}
-        self._publish(key(self._robot, self._serial, Leaf.SETPOINT), head | aims)
 
     def replay(self) -> None:
         """Send again what was overheard."""

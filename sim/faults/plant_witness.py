@@ -1,9 +1,11 @@
 """What the motors truly did, tick by tick, against what was commanded.
 
-The witness sees the plant and the bytes on the wire, and neither the firmware's state nor its opinion.
+The witness sees the plant and the bytes on the wire, and neither the firmware's state nor its opinion. But
+nothing answers a set-point: which one is followed is what the module's own rows say.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -12,9 +14,10 @@ import numpy as np
 from module_agent.control.safety import UNCONFIGURED
 from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
 from module_agent.model.catalogue import ModuleType, module_type
-from module_agent.wire.codec import decode
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.feedback_rows import STATE_NAMES, unpack
 from module_agent.wire.keys import KeyParts, Leaf, parse
-from module_agent.wire.messages import Ack, LeaseRequest
+from module_agent.wire.messages import Ack, Feedback, GainsCommand, LeaseRequest, MotionCommand, Setpoint
 from module_agent.wire.refusal import WireError
 from sim.geometry.pose import Array
 from sim.virtual_time.loop import NS_PER_S
@@ -25,6 +28,13 @@ from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM, Q_RAD, QD_RAD_S
 
 LIFETIME_NS = 250_000_000
 COMMANDS = (Leaf.LEASE, Leaf.MOTION, Leaf.SETPOINT, Leaf.GAINS)
+# What asks for an answer to a command.
+_REQUESTS: dict[Leaf, type[LeaseRequest] | type[MotionCommand] | type[GainsCommand]] = {
+    Leaf.LEASE: LeaseRequest,
+    Leaf.MOTION: MotionCommand,
+    Leaf.GAINS: GainsCommand,
+}
+_STREAMING = STATE_NAMES.index("streaming")
 # Below this the sign of a speed is that of its noise on a springy joint [rad/s].
 SLOW_RAD_S = 0.05
 # Of a motor, seen at the output, over the speed of its type: loops overshoot their clamps. The output swings
@@ -45,17 +55,22 @@ _LOOKED_AT = [ASKED, PLANT_MOTOR_RAD_S, Q_RAD]
 
 
 class _Held(NamedTuple):
-    """A lease: the boot of its module, the endpoint that it was granted, and until when by the world [ns]."""
+    """A lease: the boot of its module, the endpoint that it was granted, and until when by the world [ns].
+
+    since_ns: when it was granted, by the module's clock. by: "none" of a lease that was released.
+    """
 
     boot: int
     by: str
     until_ns: int
+    since_ns: int
 
 
 class _Request(NamedTuple):
-    """What was asked of a lease: by which endpoint, and whether it was to be acquired."""
+    """What was asked of a module: by which endpoint, the bytes, and whether a lease was to be acquired."""
 
     by: str
+    payload: bytes
     acquires: bool
 
 
@@ -88,61 +103,104 @@ class PlantWitness:
         self._accepted_ns: dict[str, int] = {}
         # When modules accepted a stop that no acquisition has ended since.
         self._stopped_ns: dict[str, int] = {}
-        self._requests: dict[tuple[str, str, int], _Request] = {}
+        # The newest request of each number to a module, and who first sent a set-point of a position.
+        self._requests: dict[tuple[str, Leaf, int], _Request] = {}
+        self._setpoints: dict[str, dict[float, str]] = {}
         self._leases: dict[str, _Held] = {}
         self._usual: _Usual | None = None
 
     def tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
         """Note who commands which module, and what that accepts; a `Tap` of the virtual network."""
-        if kind == "sample" and endpoint not in self._commanders:
-            return
         try:
             parts = parse(key)
         except WireError:
             return
-        if kind != "reply":
-            if endpoint in self._commanders and parts.leaf in COMMANDS:
-                self._sent_ns[parts.serial] = now_ns
-                if kind == "sample":
-                    # Nothing answers what is published: a command that is refused counts, too.
-                    self._accepted_ns[parts.serial] = now_ns
-            if parts.leaf is Leaf.LEASE:
-                self._asked(parts.serial, endpoint, payload)
-        elif endpoint == parts.serial and parts.leaf in (*COMMANDS, Leaf.STOP):
-            try:
-                self._answered(now_ns, parts, decode(Ack, payload))
-            except WireError:
-                return
+        if kind == "reply":
+            if endpoint == parts.serial and parts.leaf in (*COMMANDS, Leaf.STOP):
+                with suppress(WireError):
+                    self._answered(now_ns, parts, decode(Ack, payload))
+            return
+        if endpoint in self._commanders and parts.leaf in COMMANDS:
+            self._sent_ns[parts.serial] = now_ns
+            if kind == "sample":
+                # Nothing answers what is published: a command that is refused counts, too.
+                self._accepted_ns[parts.serial] = now_ns
+        if parts.leaf is Leaf.SETPOINT:
+            self._streamed(parts.serial, endpoint, payload)
+        elif parts.leaf is Leaf.LEASE or (parts.leaf in _REQUESTS and kind == "request"):
+            self._asked(parts, endpoint, payload)
+        elif parts.leaf is Leaf.FEEDBACK and parts.serial in self._setpoints and endpoint == parts.serial:
+            self._follows(parts.serial, payload)
 
     def _answered(self, now_ns: int, parts: KeyParts, ack: Ack) -> None:
         if not ack.accepted:
             return
-        if parts.leaf is Leaf.STOP:
-            self._stopped_ns.setdefault(parts.serial, now_ns)
+        serial, leaf = parts.serial, parts.leaf
+        if leaf is Leaf.STOP:
+            self._stopped_ns.setdefault(serial, now_ns)
             return
-        self._accepted_ns[parts.serial] = now_ns
-        if parts.leaf is not Leaf.LEASE:
+        self._accepted_ns[serial] = now_ns
+        asked, held = self._requests.get((serial, leaf, ack.re)), self._leases.get(serial)
+        asker = "?" if asked is None else asked.by
+        acquires = leaf is Leaf.LEASE and (asked is None or asked.acquires)
+        if not acquires and asked is not None:
+            self._check_holder(serial, f"accepts {leaf.value} of", asker)
+        if leaf is not Leaf.LEASE:
             return
         if ack.holder is None:
-            self._leases.pop(parts.serial, None)
+            self._leases[serial] = _Held(ack.boot, "none", now_ns, ack.t_ns)
             return
-        held = self._leases.get(parts.serial)
-        asker, acquires = self._requests.get((parts.serial, ack.holder, ack.re), _Request("?", True))
         if acquires:
             # Nothing else ends a stop. A keep-alive of a motion that is done is accepted after it, too.
-            self._stopped_ns.pop(parts.serial, None)
+            self._stopped_ns.pop(serial, None)
         if held is not None and held.boot == ack.boot and now_ns < held.until_ns and held.by != asker:
-            self._note("two holders", f"module {parts.serial} is held by {held.by} and obeys {asker}")
-        self._leases[parts.serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns)
+            self._note("two holders", f"module {serial} is held by {held.by} and obeys {asker}")
+        since_ns = ack.t_ns if acquires or held is None else held.since_ns
+        self._leases[serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns, since_ns)
 
-    def _asked(self, serial: str, endpoint: str, payload: bytes) -> None:
+    def _asked(self, parts: KeyParts, endpoint: str, payload: bytes) -> None:
         try:
-            request = decode(LeaseRequest, payload)
+            request = decode(_REQUESTS[parts.leaf], payload)
         except WireError:
             return
-        # A copy of a request is no request of who copied it.
-        asked = _Request(self._commanders.get(endpoint, endpoint), request.action == "acquire")
-        self._requests.setdefault((serial, request.sender, request.seq), asked)
+        before = self._requests.get((parts.serial, parts.leaf, request.seq))
+        if before is not None and before.payload == payload:
+            # A copy of a request is no request of who copied it.
+            return
+        acquires = isinstance(request, LeaseRequest) and request.action == "acquire"
+        asked = _Request(self._commanders.get(endpoint, endpoint), payload, acquires)
+        self._requests[parts.serial, parts.leaf, request.seq] = asked
+
+    def _streamed(self, serial: str, endpoint: str, payload: bytes) -> None:
+        try:
+            position_rad = decode(Setpoint, payload).position_rad
+        except WireError:
+            return
+        if position_rad is not None:
+            by = self._commanders.get(endpoint, endpoint)
+            self._setpoints.setdefault(serial, {}).setdefault(position_rad, by)
+
+    def _follows(self, serial: str, payload: bytes) -> None:
+        """Judge whose set-points a module follows by its own rows."""
+        try:
+            feedback = decode(Feedback, payload, MAX_MESSAGE_BYTES)
+            rows = unpack(feedback)
+        except WireError:
+            return
+        held = self._leases.get(serial)
+        if held is not None:
+            # The rows of a message may begin before the lease does.
+            rows = rows[rows["t_ns"] > held.since_ns] if held.boot == feedback.boot else rows[:0]
+        for target_rad in rows["position_command_rad"][rows["state"] == _STREAMING].tolist():
+            by = self._setpoints[serial].get(target_rad)
+            if by is not None:
+                self._check_holder(serial, "follows a set-point of", by)
+
+    def _check_holder(self, serial: str, does: str, by: str) -> None:
+        held = self._leases.get(serial)
+        holder = "none" if held is None else held.by
+        if holder != by:
+            self._note("command of a stranger", f"module {serial} {does} {by}, its holder is {holder}")
 
     def check(self, robot: VirtualRobot, seen: Array) -> None:
         """Judge what the motors did in the ticks (T, rows, n) that have just ended; see `QuietRun.seen`."""

@@ -19,9 +19,11 @@ from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.session_file import SessionWriter
 from coordinator.session.run import Run
 from coordinator.session.session import Session
+from module_agent.firmware.admission import Admission
 from module_agent.firmware.firmware import Answer, Firmware
 from module_agent.hardware import motor_guard
 from module_agent.hardware.motor_guard import MotorGuard
+from module_agent.wire.messages import MotionCommand, Setpoint
 from sim.faults import run
 from sim.faults.report import run_seed
 from sim.faults.schedule import draw
@@ -37,6 +39,8 @@ KILLED = 89
 FROZEN = 289
 # An intruder commands in the holder's name; later a torque sensor breaks, which ends the session.
 STOLEN = 81
+# So does one while the joint that it commands is held, and set-points would be followed.
+FORGED = 284
 # Messages are corrupted while joints move.
 CORRUPTED = 10
 # A program with the holder's secret drives a joint by full PWM.
@@ -53,7 +57,9 @@ HARMLESS = 102
 HARMLESS_HANGING = 7
 
 
-@pytest.mark.parametrize("seed", [KILLED, FROZEN, STOLEN, RECKLESS, STOPPED, HOT, HARMLESS, HARMLESS_HANGING])
+@pytest.mark.parametrize(
+    "seed", [KILLED, FROZEN, STOLEN, FORGED, RECKLESS, STOPPED, HOT, HARMLESS, HARMLESS_HANGING]
+)
 def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
     assert found(seed) == {}
 
@@ -124,6 +130,20 @@ def test_a_module_that_takes_any_proof_gets_two_holders(monkeypatch: pytest.Monk
     monkeypatch.setattr("module_agent.firmware.admission.hmac.compare_digest", lambda one, other: True)
     monkeypatch.setattr("module_agent.firmware.admission.is_proven", lambda payload, secret: True)
     assert "two holders" in found(STOLEN)
+
+
+@pytest.mark.parametrize("kind", [Setpoint, MotionCommand])
+def test_a_module_that_admits_any_command_of_a_kind_obeys_a_stranger(
+    monkeypatch: pytest.MonkeyPatch, kind: type[Setpoint | MotionCommand]
+) -> None:
+    check = Admission.check_command
+
+    def admit(admission: Admission, command: Any, *how: Any) -> None:
+        if not isinstance(command, kind):
+            check(admission, command, *how)
+
+    monkeypatch.setattr(Admission, "check_command", admit)
+    assert set(found(FORGED)) == {"command of a stranger"}
 
 
 def test_a_coordinator_that_mixes_up_its_modules_misnames_the_cause(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from module_agent.wire.codec import encode
+from module_agent.wire.feedback_rows import ROW, STATE_NAMES
 from module_agent.wire.keys import Leaf, key
-from module_agent.wire.messages import Ack, LeaseRequest
+from module_agent.wire.messages import Ack, Feedback, LeaseRequest, MotionCommand, Rest, Setpoint
 from sim.faults.plant_witness import LIFETIME_NS, PlantWitness, _Usual
 from sim.virtual_time.quiet_run import ASKED, SEEN_ROWS
 from sim.world.world_kernel import PLANT_MOTOR_RAD_S, PLANT_PWM, Q_RAD, QD_RAD_S
@@ -26,8 +27,10 @@ class Scene:
         self.now_ns = self._seq = 0
         self.winding_c = 40.0
 
-    def accept(self, leaf: Leaf, action: Literal["acquire", "renew"] | None = None) -> None:
-        """Let the coordinator ask for something which the module grants."""
+    def accept(
+        self, leaf: Leaf, action: Literal["acquire", "renew", "release"] | None = None, by: str = HOLDER
+    ) -> None:
+        """Let a program ask in the coordinator's name for something which the module grants."""
         self.now_ns += MS
         self._seq += 1
         at = key(ROBOT, SERIAL, leaf)
@@ -35,7 +38,12 @@ class Scene:
         if action is not None:
             head: dict[str, Any] = {"serial": SERIAL, "boot": 1, "seq": self._seq, "sender": HOLDER}
             payload = encode(LeaseRequest(**head, token=1, echo_ns=1, action=action))
-        self.witness.tap(self.now_ns, HOLDER, "request", at, payload)
+        elif leaf is Leaf.MOTION:
+            head = {"serial": SERIAL, "boot": 1, "seq": self._seq, "sender": HOLDER}
+            payload = encode(
+                MotionCommand(**head, token=1, echo_ns=1, motion_id=1, pattern=Rest(duration_s=1.0))
+            )
+        self.witness.tap(self.now_ns, by, "request", at, payload)
         answer = Ack(
             serial=SERIAL,
             boot=1,
@@ -45,11 +53,31 @@ class Scene:
             reason="",
             detail="",
             t_ns=1,
-            holder=HOLDER,
+            holder=None if action == "release" else HOLDER,
             lease_left_ns=1000 * MS,
             token=1,
         )
         self.witness.tap(self.now_ns, SERIAL, "reply", at, encode(answer))
+
+    def stream(self, by: str, position_rad: float) -> None:
+        """Let a program send a set-point in the holder's name."""
+        self._seq += 1
+        head: dict[str, Any] = {"serial": SERIAL, "boot": 1, "seq": self._seq, "sender": HOLDER, "token": 1}
+        aims: dict[str, Any] = {"position_rad": position_rad, "velocity_rad_s": None, "effort_nm": None}
+        point = encode(Setpoint(**head, echo_ns=1, **aims))
+        self.witness.tap(self.now_ns, by, "sample", key(ROBOT, SERIAL, Leaf.SETPOINT), point)
+
+    def followed(self, position_rad: float, state: str = "streaming", t_ns: int = 2) -> set[str]:
+        """Return what the witness notes of a module whose rows say that it follows a position."""
+        rows = np.zeros(3, ROW)
+        rows["position_command_rad"], rows["state"][1], rows["t_ns"] = (
+            position_rad,
+            STATE_NAMES.index(state),
+            t_ns,
+        )
+        feedback = Feedback(serial=SERIAL, boot=1, seq=1, first_row=0, count=3, rows=rows.tobytes())
+        self.witness.tap(self.now_ns, SERIAL, "sample", key(ROBOT, SERIAL, Leaf.FEEDBACK), encode(feedback))
+        return set(self.witness.violations)
 
     def judged(self, pwm: float, speed_rad_s: float) -> set[str]:
         """Return what the witness notes of a motor that is driven after the lifetime of the last command."""
@@ -94,6 +122,35 @@ def test_a_module_that_was_armed_after_a_stop_is_stopped_no_more() -> None:
     scene.accept(Leaf.STOP)
     scene.accept(Leaf.LEASE, "acquire")
     assert scene.judged(pwm=0.018, speed_rad_s=-0.5) == {"driven too late"}
+
+
+@pytest.mark.parametrize("action", ["renew", "release", None])
+def test_a_module_accepts_no_command_of_who_does_not_hold_it(action: Any) -> None:
+    scene = armed()
+    scene.accept(Leaf.MOTION if action is None else Leaf.LEASE, action, by="intruder")
+    assert "command of a stranger" in scene.witness.violations
+    own = armed()
+    own.accept(Leaf.MOTION if action is None else Leaf.LEASE, action)
+    assert own.witness.violations == {}
+
+
+def test_a_module_follows_no_set_point_of_who_does_not_hold_it() -> None:
+    scene = armed()
+    scene.stream("intruder", 0.3)
+    scene.stream(HOLDER, 0.2)
+    assert scene.followed(0.2) == set()
+    # It holds by chance where the intruder aimed, or shows while it brakes what it followed before.
+    assert scene.followed(0.3, "armed") == set()
+    # Nor does a row of before the lease, in one message with those of it, tell of it.
+    assert scene.followed(0.3, t_ns=1) == set()
+    assert scene.followed(0.3) == {"command of a stranger"}
+
+
+def test_a_copy_of_the_holder_s_set_point_is_the_holder_s() -> None:
+    scene = armed()
+    scene.stream(HOLDER, 0.2)
+    scene.stream("intruder", 0.2)
+    assert scene.followed(0.2) == set()
 
 
 def test_a_module_that_has_accepted_a_stop_brakes_from_two_ticks_after_it() -> None:
