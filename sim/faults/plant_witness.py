@@ -110,7 +110,10 @@ class PlantWitness:
         self._usual: _Usual | None = None
 
     def tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
-        """Note who commands which module, and what that accepts; a `Tap` of the virtual network."""
+        """Note who commands which module, and what that accepts; a `Tap` of the virtual network.
+
+        `now_ns` is when a program sent it: of what was delayed on the way to the network that is earlier.
+        """
         try:
             parts = parse(key)
         except WireError:
@@ -121,10 +124,10 @@ class PlantWitness:
                     self._answered(now_ns, parts, decode(Ack, payload))
             return
         if endpoint in self._commanders and parts.leaf in COMMANDS:
-            self._sent_ns[parts.serial] = now_ns
+            self._sent_ns[parts.serial] = max(now_ns, self._sent_ns.get(parts.serial, now_ns))
             if kind == "sample":
                 # Nothing answers what is published: a command that is refused counts, too.
-                self._accepted_ns[parts.serial] = now_ns
+                self._accepted_ns[parts.serial] = max(now_ns, self._accepted_ns.get(parts.serial, now_ns))
         if parts.leaf is Leaf.SETPOINT:
             self._streamed(parts.serial, endpoint, payload)
         elif parts.leaf is Leaf.LEASE or (parts.leaf in _REQUESTS and kind == "request"):

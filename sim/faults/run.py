@@ -89,7 +89,7 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
     Any exception but a `RobotError` is a defect of the product, and passes.
     """
     loop = VirtualLoop()
-    taps: list[Tap] = [witness.tap]
+    taps: list[Tap] = []
 
     def tap(now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
         for each in taps:
@@ -106,6 +106,7 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
     )
     robot = FaultyRobot(settings, loop, VirtualNetwork(loop, tap), schedule.faults)
     session = _Session(schedule, robot, out, taps)
+    taps.append(partial(session.witnessed, witness))
     robot.on_run.append(partial(witness.check, robot))
     try:
         return session.run()
@@ -125,6 +126,7 @@ class _Session:
         self._out = out
         self._taps = taps
         self._cable = CableState()
+        self._way: Cable | None = None
         self._disturbances: list[Fault] = []
         self._sender = COORDINATOR
         self._restarts = self._killed = False
@@ -157,6 +159,14 @@ class _Session:
             write_truth(self._out / "truth.json", robot.world.robot)
         return ending
 
+    def witnessed(
+        self, witness: PlantWitness, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes
+    ) -> None:
+        """Let the witness see a message: what a coordinator sent is as old as it left its program."""
+        if self._way is not None and endpoint == self._sender and self._way.given_ns is not None:
+            now_ns = self._way.given_ns
+        witness.tap(now_ns, endpoint, kind, key, payload)
+
     def _coordinate(self, resume: bool) -> Ending:
         robot, loop = self._robot, self._robot.loop
         config = RunConfig(
@@ -171,7 +181,7 @@ class _Session:
             # No invariant looks at it, and its library waits for ever where its file cannot grow.
             keeps_view=False,
         )
-        cable = Cable(robot.endpoint(self._sender), loop, self._cable)
+        self._way = cable = Cable(robot.endpoint(self._sender), loop, self._cable)
         task: asyncio.Task[Result] | None = None
         try:
             run = Run(config, cable, lambda: loop.now_ns, loop.call_soon, SilentScreen())

@@ -20,7 +20,6 @@ from module_agent.hardware.loop_inside import LoopInside
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile
-from module_agent.transport.transport import Transport
 from sim.geometry.pose import Array
 from sim.hebi_stand_in.library import Group, StandIn
 from sim.hebi_stand_in.modules import ModuleNetwork
@@ -152,7 +151,7 @@ class VirtualRobot:
         # Those of modules that start again.
         return endpoints, itertools.chain(first, iter(lambda: int(rng.integers(1, 2**63)), 0))
 
-    def endpoint(self, name: str) -> Transport:
+    def endpoint(self, name: str) -> ImpairedTransport:
         """Return a transport of the virtual network, impaired as the profile says."""
         rng = np.random.default_rng(self._endpoint_seeds.spawn(1)[0])
         return ImpairedTransport(
