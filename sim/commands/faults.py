@@ -1,6 +1,7 @@
 """`x5-sim faults`: search by seeds for faults that the system does not survive."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +19,7 @@ from sim.benchmark.workers import run_trials
 from sim.commands.experiment import experiment, worker_count
 from sim.commands.options import load
 from sim.faults.fault import Fault, fault_of
+from sim.faults.invariants import NO_LINK, VAGUE_DEG, VAGUE_MM
 from sim.faults.report import OUTCOMES, SeedReport, by_fault, run_seed
 from sim.faults.schedule import Schedule, draw, first_modules
 from sim.physics.engine import Physics
@@ -92,13 +94,11 @@ def faults(
         "suspicions name what happened",
         err=json_file == STANDARD_OUTPUT,
     )
-    claims = [one.widest_claim_mm for one in reports if one.widest_claim_mm is not None]
-    if claims:
-        typer.echo(
-            f"lengths of {len(claims)} right robots are claimed to {np.median(claims):.1f} mm (the widest of "
-            f"each, median), {max(claims):.1f} mm at most",
-            err=json_file == STANDARD_OUTPUT,
-        )
+    wrong = [one for one in reports if one.outcome == "wrong though suspected"]
+    for one in wrong:
+        typer.echo(f"seed {one.seed}: wrong though suspected: {one.wrong}; suspected is {one.text}", err=True)
+    if claims := claimed(reports):
+        typer.echo(claims, err=json_file == STANDARD_OUTPUT)
     if violated:
         raise typer.Exit(EXIT_FINDING)
 
@@ -123,6 +123,27 @@ def described(report: SeedReport, robot: str | None = None) -> str:
     if simplest is not None and simplest.options() != report.options():
         lines.append(f"  or simpler:     x5-sim faults {simplest.options(robot)}")
     return "\n".join(lines)
+
+
+def claimed(reports: Sequence[SeedReport]) -> str:
+    """Return a sentence on how wide the claims of right robots are; "" without any."""
+    claims = [(one.claim, one.seed) for one in reports if one.claim is not None]
+    if not claims:
+        return ""
+    vague = sum(claim.is_vague for claim, _ in claims)
+    widest, seed = max(claims, key=lambda one: one[0].width)
+    compared = [claim for claim, _ in claims if claim.link != NO_LINK]
+    usual = (
+        f", the widest claim of each is {np.median([one.mm for one in compared]):.1f} mm and "
+        f"{np.median([one.deg for one in compared]):.2f} degrees in the median"
+        if compared
+        else ""
+    )
+    return (
+        f"{vague} of {len(claims)} right robots are vague (a sigma above {VAGUE_MM:g} mm or {VAGUE_DEG:g} "
+        f"degree, or no link compared){usual}; the widest: seed {seed}, {widest.link}, {widest.mm:.1f} mm, "
+        f"{widest.deg:.2f} degrees"
+    )
 
 
 def figures(seeds: range, outcomes: Sequence[Any]) -> dict[str, Any]:
@@ -200,9 +221,10 @@ def _run(units: Sequence[Unit], store: Store | None, workers: int | None, dask: 
 
 
 def _print_table(reports: list[SeedReport]) -> None:
-    table = new_table("Outcomes by fault", " | ".join(("fault", *(f">{one}" for one in OUTCOMES))))
-    for kind, counted in by_fault(reports).items():
-        if not counted:
-            continue
-        table.add_row(kind, *(str(counted[one]) for one in OUTCOMES))
+    rows = {kind: counted for kind, counted in by_fault(reports).items() if counted}
+    rows["all seeds"] = Counter(one.outcome for one in reports)
+    found = [one for one in OUTCOMES if any(counted[one] for counted in rows.values())]
+    table = new_table("Outcomes by fault", " | ".join(("fault", *(f">{one}" for one in found))))
+    for kind, counted in rows.items():
+        table.add_row(kind, *(str(counted[one]) for one in found))
     print_table(table)

@@ -1,15 +1,19 @@
 """What must hold of every session, whatever happened in it."""
 
-import json
+import math
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from coordinator.identification.result import Result
 from coordinator.recording.journal import refused_by_limits
 from coordinator.recording.run_folder import RESULT, SESSION, load_recording
+from coordinator.recording.session_file import MCAP0_MAGIC
 from module_agent.model.errors import RobotError
-from sim.faults.run import Ending
+from sim.faults.run import WITH_RESULT, Ending
 from sim.faults.schedule import Schedule
 from sim.scoring.score import LinkScore, Score, score
 
@@ -24,8 +28,57 @@ TIP_DEG, TIP_MM = 3.0, 20.0
 GRAVITY_DEG = 3.0
 
 
-def check_folder(out: Path, ending: Ending) -> dict[str, str]:
-    """Return violations by kind: an unreadable recording or result, an unbounded run, a wrong result."""
+# A claim that is wider says little: no error would be beyond it.
+VAGUE_MM, VAGUE_DEG = 5.0, 1.0
+# Endings that leave a recording at least.
+WITH_RECORDING = (*WITH_RESULT, "lost")
+NO_LINK = "no link"
+
+
+class Claim(NamedTuple):
+    """The widest of the claims of a robot's links: of its length or way across the joint, and of its axis.
+
+    link: which it is of, "no link" where none was compared with the truth. Standard deviations.
+    """
+
+    link: str
+    mm: float
+    deg: float
+
+    @property
+    def width(self) -> float:
+        """How wide it is, over what counts as vague; infinite of no link at all."""
+        return max(self.mm / VAGUE_MM, self.deg / VAGUE_DEG) if self.link != NO_LINK else math.inf
+
+    @property
+    def is_vague(self) -> bool:
+        """Whether it says little."""
+        return self.width > 1.0
+
+
+class FolderCheck(NamedTuple):
+    """What the folder of a session says about it.
+
+    violations: by kind. claim: how wide the claims are of a result that is not called suspect, None of
+    others. wrong: what is wrong with one that is, beyond all that it claims. is_explained: whether one of its
+    suspicions concerns a module at the ends of the link that is wrong, or any module if the whole robot is.
+    """
+
+    violations: dict[str, str]
+    claim: Claim | None = None
+    wrong: str = ""
+    is_explained: bool = False
+
+
+class _Wrong(NamedTuple):
+    """What is wrong with a result, and the modules next to it; none for the whole robot."""
+
+    text: str
+    modules: frozenset[str] = frozenset()
+
+
+def check_folder(out: Path, ending: Ending) -> FolderCheck:
+    """Return the violations of a session: of its recording, its result, and its time; and what it claims."""
     violations: dict[str, str] = {}
     if ending.name == "unbounded":
         violations["unbounded"] = ending.text
@@ -36,27 +89,65 @@ def check_folder(out: Path, ending: Ending) -> dict[str, str]:
         except RobotError as error:
             violations["unreadable recording"] = str(error)
         else:
-            if recording.damage and ending.name != "lost":
+            # Where its writer was killed it has no end, which is no damage.
+            if recording.damage:
                 violations["unreadable recording"] = recording.damage[0]
-    if ending.name == "result" and recording is not None:
-        try:
-            Result.model_validate_json((out / RESULT).read_bytes())
-            wrong = _wrong(out, ending.unheard, refused_by_limits(recording.journal))
-        except (ValidationError, RobotError) as error:
-            violations["unreadable result"] = str(error)
-        else:
-            if wrong:
-                violations["wrong robot"] = wrong
-    return violations
+            elif ending.name in WITH_RESULT and not _has_end(out / SESSION):
+                violations["unreadable recording"] = f"{SESSION} is cut off"
+    elif ending.name in WITH_RECORDING:
+        violations["no recording"] = f"the session ended as {ending.name!r} and left no {SESSION}"
+    if ending.name not in WITH_RESULT:
+        return FolderCheck(violations)
+    try:
+        result = Result.model_validate_json((out / RESULT).read_bytes())
+        unmoved = set() if recording is None else refused_by_limits(recording.journal)
+        scored = score(out)
+    except (OSError, ValidationError, RobotError) as error:
+        return FolderCheck(violations | {"unreadable result": str(error)})
+    if ending.name == "result":
+        wrong = _wrong(scored, ending.unheard, unmoved, believed=True)
+        violations |= {"wrong robot": wrong.text} if wrong.text else {}
+        return FolderCheck(violations, _widest(scored, ending.unheard, unmoved))
+    # Modules that it says it is without are no errors of the rest.
+    without = {s for s in _serials(scored) - set(result.serials) if _has_serial(ending.text, s)}
+    wrong = _wrong(scored, ending.unheard | without, unmoved, believed=False)
+    near = wrong.modules or _serials(scored)
+    is_explained = any(_has_serial(ending.text, serial) for serial in near)
+    return FolderCheck(violations, wrong=wrong.text, is_explained=is_explained)
 
 
-def widest_claim_mm(out: Path) -> float | None:
-    """Return the largest sigma that a result claims of the length of a link; None if it claims none.
+def _has_end(recording: Path) -> bool:
+    return recording.read_bytes().endswith(MCAP0_MAGIC)
 
-    No error is beyond a claim that is wide enough: so the search reports how wide claims are.
-    """
-    sigmas = (link["link_length_sigma_mm"] for link in json.loads((out / RESULT).read_bytes())["links"])
-    return max((sigma for sigma in sigmas if sigma is not None), default=None)
+
+def _serials(scored: Score) -> frozenset[str]:
+    """Return the modules of the true robot: each is at an end of a link."""
+    return frozenset(serial for link in scored.links for serial in (link.parent, link.child))
+
+
+def _has_serial(text: str, serial: str) -> bool:
+    return re.search(rf"(?<!\w){re.escape(serial)}(?!\w)", text) is not None
+
+
+def _compared(scored: Score, unheard: frozenset[str] | set[str], unmoved: set[str]) -> Iterator[LinkScore]:
+    """Yield the links that are compared with the truth; see `_wrong`."""
+    for link in scored.links:
+        if link.parent not in unheard | unmoved and link.child not in unheard:
+            yield link
+
+
+def _widest(scored: Score, unheard: frozenset[str], unmoved: set[str]) -> Claim:
+    """Return the widest claim of the links that are compared."""
+    claims = [
+        Claim(
+            f"{link.parent} - {link.child}",
+            max(link.link_length_sigma_mm, link.link_vector_sigma_mm or 0.0),
+            link.axis_sigma_deg or 0.0,
+        )
+        for link in _compared(scored, unheard, unmoved)
+        if link.link_length_sigma_mm is not None
+    ]
+    return max(claims, key=lambda claim: claim.width, default=Claim(NO_LINK, 0.0, 0.0))
 
 
 def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
@@ -70,14 +161,14 @@ def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
     return bool(accused) and not accused & sick and "expected, found" not in ending.text
 
 
-def _wrong(out: Path, unheard: frozenset[str], unmoved: set[str]) -> str:
+def _wrong(scored: Score, unheard: frozenset[str] | set[str], unmoved: set[str], believed: bool) -> _Wrong:
     """Say what is wrong with the result, but for what nothing could show.
 
     unheard: modules that do not exist for the coordinator, whose neighbours are mounted on each other for it.
     unmoved: modules that refused to turn their joint by their own limits: how they are mounted, and what they
-    carry, is not known.
+    carry, is not known. believed: whether its exit code says that it is right: then something is claimed of
+    every link.
     """
-    scored = score(out)
     carried = {link.child for link in scored.links if link.parent in unheard | unmoved}
     unknown = (
         *(f"module {serial} was not found" for serial in unheard),
@@ -86,14 +177,15 @@ def _wrong(out: Path, unheard: frozenset[str], unmoved: set[str]) -> str:
     )
     differences = [text for text in scored.topology_differences if not text.startswith(unknown)]
     if differences:
-        return "; ".join(differences)
-    for link in scored.links:
-        if link.parent in unheard | unmoved or link.child in unheard:
-            continue
-        wrong = _wrong_link(link)
+        text = "; ".join(differences)
+        return _Wrong(text, frozenset(s for s in _serials(scored) if _has_serial(text, s)))
+    for link in _compared(scored, unheard, unmoved):
+        is_claimed = believed or link.link_length_sigma_mm is not None
+        wrong = _wrong_link(link) if is_claimed else ""
         if wrong:
-            return f"link {link.parent} - {link.child} {wrong}"
-    return "" if unheard | unmoved else _wrong_robot(scored)
+            modules = frozenset((link.parent, link.child))
+            return _Wrong(f"link {link.parent} - {link.child} {wrong}", modules)
+    return _Wrong("" if unheard | unmoved else _wrong_robot(scored))
 
 
 def _wrong_link(link: LinkScore) -> str:

@@ -11,14 +11,25 @@ from typing import Literal, NamedTuple, get_args
 
 from module_agent.model.errors import RobotError
 from sim.faults.fault import KINDS
-from sim.faults.invariants import check_folder, is_misnamed, widest_claim_mm
+from sim.faults.invariants import Claim, FolderCheck, check_folder, is_misnamed
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import Schedule, simpler
 from sim.physics.engine import Physics
 
-Outcome = Literal["right", "suspect", "named", "misnamed", "stopped", "violation"]
+Outcome = Literal[
+    "right",
+    "vague",
+    "suspect, right",
+    "suspect, wrong",
+    "wrong though suspected",
+    "named",
+    "misnamed",
+    "stopped",
+    "violation",
+]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
-_WITHOUT_ERROR: dict[str, Outcome] = {"result": "right", "suspect": "suspect", "lost": "stopped"}
+# Those that say that something is wrong.
+_ACCUSING = ("suspect, right", "suspect, wrong", "wrong though suspected", "named", "misnamed")
 # Sessions that a violation is made simpler in, at the most.
 MAX_SHRINKING = 20
 
@@ -27,12 +38,13 @@ class SeedReport(NamedTuple):
     """What became of a seed.
 
     modules, network, faults, physics, expects: the session, so that it can be run again. kinds: of faults.
-    outcome: the right robot with exit code 0, a result called suspect, an error that names what
-    may have happened, one that accuses a healthy module, stopped with its coordinator killed, or a violation
-    of an invariant.
+    outcome: the right robot with exit code 0, or one whose claims are so wide that it says little; a result
+    called suspect that is right within its claims, that is wrong, or that is wrong where none of its
+    suspicions is; an error that names what may have happened, or accuses a healthy module; stopped with its
+    coordinator killed; or a violation of an invariant.
     named_rightly: whether an error or a suspicion names a fault that had begun, None without either.
     simplest: the simplest session found that violates the same invariant, None if none was looked for.
-    widest_claim_mm: the largest sigma of a link's length in the right robot; None without one.
+    claim: the widest of the right robot; None without one. wrong: what is wrong with a suspect one.
     """
 
     seed: int
@@ -49,7 +61,8 @@ class SeedReport(NamedTuple):
     simplest: "SeedReport | None" = None
     physics: Physics = "compiled"
     expects: bool = True
-    widest_claim_mm: float | None = None
+    claim: Claim | None = None
+    wrong: str = ""
 
     def options(self, robot: str | None = None) -> str:
         """Return the options of `x5-sim faults` that repeat it; `robot` is the robot as the user gave it."""
@@ -117,10 +130,9 @@ def _judged(schedule: Schedule) -> SeedReport:
             violations["traceback"] = _described(error)
         if logged:
             violations.setdefault("traceback", f"logged: {_described(logged[0])}")
-        violations |= witness.violations | check_folder(Path(folder) / "run", ending)
-        is_right = ending.name == "result" and not violations
-        claim = widest_claim_mm(Path(folder) / "run") if is_right else None
-    outcome = _WITHOUT_ERROR.get(ending.name, "misnamed" if is_misnamed(schedule, ending) else "named")
+        checked = check_folder(Path(folder) / "run", ending)
+        violations |= witness.violations | checked.violations
+    outcome = "violation" if violations else _outcome(schedule, ending, checked)
     serials = schedule.robot.serials
     begun = [fault for fault in schedule.faults if fault.begins_s <= ending.at_s]
     named = any(fault.is_named(ending.text, serials) for fault in begun)
@@ -133,13 +145,27 @@ def _judged(schedule: Schedule) -> SeedReport:
         kinds=tuple(fault.kind for fault in schedule.faults),
         ending=ending.name,
         text=ending.text,
-        outcome="violation" if violations else outcome,
+        outcome=outcome,
         violations=violations,
         physics=schedule.physics,
         expects=schedule.expects,
-        widest_claim_mm=claim,
-        named_rightly=named if outcome in ("named", "misnamed", "suspect") and not violations else None,
+        claim=checked.claim if outcome in ("right", "vague") else None,
+        wrong=checked.wrong,
+        named_rightly=named if outcome in _ACCUSING else None,
     )
+
+
+def _outcome(schedule: Schedule, ending: Ending, checked: FolderCheck) -> Outcome:
+    """Return the outcome of a session that violates nothing."""
+    if ending.name == "result":
+        return "vague" if checked.claim is not None and checked.claim.is_vague else "right"
+    if ending.name == "suspect":
+        if not checked.wrong:
+            return "suspect, right"
+        return "suspect, wrong" if checked.is_explained else "wrong though suspected"
+    if ending.name == "lost":
+        return "stopped"
+    return "misnamed" if is_misnamed(schedule, ending) else "named"
 
 
 def _simplest(schedule: Schedule, report: SeedReport) -> SeedReport:

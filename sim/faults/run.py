@@ -38,6 +38,8 @@ SECRET = b"a-secret-of-16-b"
 LIMIT_S = 180.0
 # How long motors are observed after the coordinator has ended: several lifetimes.
 AFTERWARDS_S = 1.0
+# Endings that leave a result.
+WITH_RESULT = ("result", "suspect")
 # By how much messages are delayed.
 DELAY_S = 0.1
 # When a coordinator that was killed is started again, its lease of the modules has lapsed.
@@ -155,7 +157,7 @@ class _Session:
         if ending.name != "unbounded":
             self._wait(AFTERWARDS_S)
         limit_file_size(None)
-        if ending.name == "result":
+        if ending.name in WITH_RESULT:
             write_truth(self._out / "truth.json", robot.world.robot)
         return ending
 

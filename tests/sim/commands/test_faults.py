@@ -14,6 +14,7 @@ from sim.benchmark.case import Trial
 from sim.benchmark.workers import run_trial
 from sim.commands import faults
 from sim.faults import report
+from sim.faults.invariants import Claim, FolderCheck
 from sim.faults.plant_witness import PlantWitness
 from sim.faults.report import run_seed
 from sim.faults.run import Ending
@@ -31,8 +32,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         return Ending("result")
 
     monkeypatch.setattr(report, "run_schedule", run_schedule)
-    monkeypatch.setattr(report, "check_folder", lambda out, ending: {})
-    monkeypatch.setattr(report, "widest_claim_mm", lambda out: 1.5)
+    monkeypatch.setattr(report, "check_folder", lambda out, ending: FolderCheck({}, Claim("A - B", 1.5, 0.3)))
     monkeypatch.setattr(faults, "run_trials", one_after_another)
 
 
@@ -70,7 +70,36 @@ def test_seeds_without_violation_end_with_zero() -> None:
     found = CliRunner().invoke(app, ["faults", "--seeds", "7..7"])
     assert found.exit_code == 0
     assert "1 seeds, 0 with violations" in found.output
-    assert "lengths of 1 right robots are claimed to 1.5 mm" in found.output
+    assert "0 of 1 right robots are vague" in found.output
+    assert "the widest: seed 7, A - B, 1.5 mm, 0.30 degrees" in found.output
+
+
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize(
+    ("name", "checked", "outcome"),
+    [
+        ("result", FolderCheck({}, Claim("A - B", 6.0, 0.3)), "vague"),
+        ("suspect", FolderCheck({}), "suspect, right"),
+        ("suspect", FolderCheck({}, wrong="link A - B", is_explained=True), "suspect, wrong"),
+        ("suspect", FolderCheck({}, wrong="link A - B"), "wrong though suspected"),
+        ("suspect", FolderCheck({"unreadable result": "no"}, wrong="link A - B"), "violation"),
+    ],
+)
+def test_results_that_are_not_plainly_right_have_columns_of_their_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, checked: FolderCheck, outcome: str
+) -> None:
+    document = tmp_path / "faults.json"
+    monkeypatch.setattr(report, "run_schedule", lambda *of: Ending(name, "C: its gyro", 60.0))
+    monkeypatch.setattr(report, "check_folder", lambda out, ending: checked)
+    options = ["faults", "--seeds", "7..7", "--no-shrink"]
+    found = CliRunner().invoke(app, options)
+    assert found.exit_code == (EXIT_FINDING if outcome == "violation" else 0)
+    assert outcome.split()[-1] in found.output
+    assert ("seed 7: wrong though suspected: link A - B; suspected is C: its gyro" in found.output) is (
+        outcome == "wrong though suspected"
+    )
+    CliRunner().invoke(app, [*options, "--json", str(document)])
+    assert json.loads(document.read_text())["reports"][0]["outcome"] == outcome
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -66,11 +66,14 @@ def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
 
 def test_a_right_robot_tells_how_wide_its_claims_are() -> None:
     """Which no invariant bounds: a claim that is wide enough is never wrong."""
-    claim = run_seed(draw(HARMLESS)).widest_claim_mm
-    # Short motions and the catalogue's places of IMUs leave some millimetres.
-    assert claim is not None
-    assert 0.5 < claim < 10.0
-    assert run_seed(draw(FROZEN)).widest_claim_mm is None
+    report = run_seed(draw(HARMLESS))
+    assert report.outcome == "right"
+    assert report.claim is not None
+    assert report.claim.link == " - ".join(draw(HARMLESS).robot.serials)
+    # Short motions and the catalogue's places of IMUs leave some millimetres, and parts of a degree.
+    assert 0.5 < report.claim.mm < 5.0
+    assert 0.05 < report.claim.deg < 1.0
+    assert run_seed(draw(FROZEN)).claim is None
 
 
 def test_firmware_that_does_not_expire_drives_too_late(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coordinator.identification.result import Result
-from coordinator.recording.run_folder import RESULT
+from coordinator.recording.run_folder import RESULT, SESSION
 from sim.faults import run, schedule
 from sim.faults.fault import Fault
 from sim.faults.invariants import check_folder
@@ -38,7 +38,7 @@ def result(out: Path) -> Any:
 def test_without_faults_every_module_is_measured_and_judged(robot: tuple[str, int], tmp_path: Path) -> None:
     one = session(robot)
     ending = ran(one, tmp_path / "run")
-    assert (ending.name, check_folder(tmp_path / "run", ending)) == ("result", {})
+    assert (ending.name, check_folder(tmp_path / "run", ending).violations) == ("result", {})
     written = result(tmp_path / "run")
     assert set(written["serials"]) == set(one.robot.serials)
     # Of a joint that does not move the search would compare little.
@@ -68,8 +68,8 @@ def test_a_module_that_was_not_announced_is_forgiven_only_where_modules_are_not_
     ending = ran(gone, tmp_path / "run")
     missing = gone.robot.serials[2]
     assert (ending.name, ending.unheard) == ("result", {missing})
-    assert check_folder(tmp_path / "run", ending) == {}
-    found = check_folder(tmp_path / "run", ending._replace(unheard=frozenset()))
+    assert check_folder(tmp_path / "run", ending).violations == {}
+    found = check_folder(tmp_path / "run", ending._replace(unheard=frozenset())).violations
     assert f"module {missing} was not found" in found["wrong robot"]
 
 
@@ -77,7 +77,7 @@ def test_the_result_of_a_single_module_can_be_read_again(tmp_path: Path) -> None
     """It has nothing to fit, and no condition therefore; the other module is plugged in too late."""
     one = session(("thesis_171_horizontal", 2), Fault("hot plug", 10.6, math.inf, 0), expects=False)
     ending = ran(one, tmp_path / "run")
-    assert (ending.name, check_folder(tmp_path / "run", ending)) == ("result", {})
+    assert (ending.name, check_folder(tmp_path / "run", ending).violations) == ("result", {})
     read = Result.model_validate_json((tmp_path / "run" / RESULT).read_bytes())
     assert (read.serials, read.condition, read.reduced_chi2) == ([one.robot.serials[1]], None, None)
 
@@ -89,16 +89,88 @@ def test_of_a_joint_that_its_limits_keep_still_only_what_it_carries_is_forgiven(
     first, still, last = one.robot.serials
     monkeypatch.setattr(run, "position_ranges", lambda each: ranges(each) | {still: (-0.1, 0.1)})
     ending = ran(one, tmp_path / "run")
-    assert (ending.name, check_folder(tmp_path / "run", ending)) == ("result", {})
+    assert (ending.name, check_folder(tmp_path / "run", ending).violations) == ("result", {})
     assert {m["serial"]: m["parent"] for m in result(tmp_path / "run")["topology"]}[last] == first
     path = tmp_path / "run" / "truth.json"
     truth = path.read_text()
     # The link before it is measured by the first joint.
     _displace(path, still)
-    assert f"link {first} - {still}" in check_folder(tmp_path / "run", ending)["wrong robot"]
+    assert f"link {first} - {still}" in check_folder(tmp_path / "run", ending).violations["wrong robot"]
     path.write_text(truth)
     _displace(path, last)
-    assert check_folder(tmp_path / "run", ending) == {}
+    assert check_folder(tmp_path / "run", ending).violations == {}
+
+
+@pytest.mark.parametrize("name", ["result", "suspect", "lost"])
+def test_a_session_that_leaves_no_recording_is_a_violation(name: str, tmp_path: Path) -> None:
+    assert "no recording" in check_folder(tmp_path, Ending(name)).violations
+
+
+def test_a_recording_may_lack_its_end_where_its_writer_was_killed_and_nothing_else(tmp_path: Path) -> None:
+    ending = ran(session(("thesis_171_horizontal", 2)), tmp_path / "run")
+    path = tmp_path / "run" / SESSION
+    whole, lost = path.read_bytes(), ending._replace(name="lost")
+    path.write_bytes(whole[: len(whole) // 2])
+    assert check_folder(tmp_path / "run", lost).violations == {}
+    assert (
+        check_folder(tmp_path / "run", ending).violations["unreadable recording"] == f"{SESSION} is cut off"
+    )
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + bytes(64) + whole[middle + 64 :])
+    for each in (lost, ending):
+        assert "is damaged" in check_folder(tmp_path / "run", each).violations["unreadable recording"]
+
+
+def test_a_right_robot_whose_claims_are_wide_is_vague(tmp_path: Path) -> None:
+    one = session(("thesis_171_horizontal", 2))
+    ending = ran(one, tmp_path / "run")
+    claim = check_folder(tmp_path / "run", ending).claim
+    assert claim is not None
+    assert not claim.is_vague
+    document = result(tmp_path / "run")
+    document["links"][0]["link_length_sigma_mm"] = 6.0
+    (tmp_path / "run" / RESULT).write_text(json.dumps(document))
+    wide = check_folder(tmp_path / "run", ending)
+    assert wide.violations == {}
+    assert wide.claim == claim._replace(mm=6.0)
+    assert wide.claim.is_vague
+    assert claim._replace(deg=1.1).is_vague
+    # Of one module alone no link is compared.
+    alone = check_folder(tmp_path / "run", ending._replace(unheard=frozenset(one.robot.serials[:1])))
+    assert alone.claim is not None
+    assert (alone.claim.link, alone.claim.is_vague) == ("no link", True)
+
+
+def test_a_suspect_result_is_compared_with_the_truth_and_its_suspicions_with_what_is_wrong(
+    tmp_path: Path,
+) -> None:
+    sick = session(ARM, Fault("IMU NaN", 9.0, 0.5, 2))
+    ending, (first, _, last) = ran(sick, tmp_path / "run"), sick.robot.serials
+    # It is the robot without its last module, as it says.
+    assert ending.name == "suspect"
+    assert last in ending.text
+    right = check_folder(tmp_path / "run", ending)
+    assert (right.violations, right.wrong) == ({}, "")
+    document = result(tmp_path / "run")
+    _displace(tmp_path / "run" / "truth.json", document["links"][0]["child"])
+    for text, is_explained in ((f"{first}: its encoder", True), ("the network is slow", False)):
+        found = check_folder(tmp_path / "run", ending._replace(text=f"{last}: its IMU; {text}"))
+        assert found.violations == {}
+        assert found.wrong.startswith(f"link {first} - ")
+        assert found.is_explained is is_explained
+    # Nothing is wrong with a link of which nothing is claimed.
+    document["links"][0]["link_length_sigma_mm"] = None
+    (tmp_path / "run" / RESULT).write_text(json.dumps(document))
+    assert not check_folder(tmp_path / "run", ending).wrong.startswith(f"link {first} - ")
+
+
+def test_a_suspect_result_that_cannot_be_read_is_a_violation(tmp_path: Path) -> None:
+    ending = ran(
+        session(("thesis_171_vertical", 2), Fault("motor stall", 6.2, math.inf, 0)), tmp_path / "run"
+    )
+    assert check_folder(tmp_path / "run", ending).violations == {}
+    (tmp_path / "run" / RESULT).write_text("{}")
+    assert "unreadable result" in check_folder(tmp_path / "run", ending).violations
 
 
 def test_a_wrong_axis_is_a_wrong_robot_though_every_length_is_right(tmp_path: Path) -> None:
@@ -117,7 +189,7 @@ def test_a_wrong_axis_is_a_wrong_robot_though_every_length_is_right(tmp_path: Pa
     truth["chain"]["point"][k] = (chain["point"][k] + along).tolist()
     truth["chain"]["axis"][k] = Rotation.from_rotvec(np.radians(4.0) * across).apply(axis).tolist()
     path.write_text(json.dumps(truth))
-    found = check_folder(tmp_path / "run", ending)["wrong robot"]
+    found = check_folder(tmp_path / "run", ending).violations["wrong robot"]
     assert f"link {first} - {second} the axis is" in found
 
 
@@ -141,7 +213,7 @@ def test_a_wrong_zero_of_an_encoder_is_a_wrong_robot_though_every_link_is_right(
     chain["axis"][leaf] = turn.apply(chain["axis"][leaf]).tolist()
     chain["point"][leaf] = (point + turn.apply(np.array(chain["point"][leaf]) - point)).tolist()
     path.write_text(json.dumps(truth))
-    assert "the tips are" in check_folder(tmp_path / "run", ending)["wrong robot"]
+    assert "the tips are" in check_folder(tmp_path / "run", ending).violations["wrong robot"]
 
 
 @pytest.mark.parametrize(
@@ -169,7 +241,7 @@ def test_a_result_that_claims_nothing_or_cannot_be_read_is_a_violation(
     else:
         document[part] = value
     (tmp_path / "run" / RESULT).write_text(json.dumps(document))
-    assert words in check_folder(tmp_path / "run", ending)[kind]
+    assert words in check_folder(tmp_path / "run", ending).violations[kind]
 
 
 def _displace(path: Path, serial: str) -> None:
