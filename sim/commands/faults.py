@@ -88,10 +88,12 @@ def faults(
         elif one.violations:
             typer.echo(described(one, robot), err=True)
             violated += 1
+    drawn, begun = sum(len(one.faults) for one in reports), sum(len(one.kinds) for one in reports)
     named = [one.named_rightly for one in reports if one.named_rightly is not None]
     typer.echo(
         f"{len(numbers)} seeds, {violated} with violations; {sum(named)} of {len(named)} errors and "
-        "suspicions name what happened",
+        f"suspicions name what happened; {drawn - begun} of {drawn} faults had not begun when their session "
+        "ended",
         err=json_file == STANDARD_OUTPUT,
     )
     wrong = [one for one in reports if one.outcome == "wrong though suspected"]

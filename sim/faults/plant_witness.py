@@ -84,6 +84,8 @@ class _Usual(NamedTuple):
 class PlantWitness:
     """Notes violations by the motors: `violations` maps each kind to the first case of it, as a sentence.
 
+    seen_until_ns: the end of what it has judged, by the world.
+
     Args:
         commanders: the names of endpoints on the network that may command, and in whose name each does.
         ranges: the configured range of position of each module that is to keep it, by serial [rad].
@@ -93,6 +95,7 @@ class PlantWitness:
         self, commanders: Mapping[str, str], ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
     ) -> None:
         self.violations: dict[str, str] = {}
+        self.seen_until_ns = 0
         self._commanders = commanders
         self._ranges = ranges
         # How far each joint has been driven on since it left its range.
@@ -207,6 +210,7 @@ class PlantWitness:
 
     def check(self, robot: VirtualRobot, seen: Array) -> None:
         """Judge what the motors did in the ticks (T, rows, n) that have just ended; see `QuietRun.seen`."""
+        self.seen_until_ns = robot.world.t_ns
         first_ns = robot.world.t_ns - len(seen) * TICK_NS
         if self._usual is None:
             self._usual = self._usual_of(robot)

@@ -15,6 +15,7 @@ from sim.faults.invariants import Claim, FolderCheck, check_folder, is_misnamed
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import Schedule, simpler
 from sim.physics.engine import Physics
+from sim.virtual_time.loop import NS_PER_S
 
 Outcome = Literal[
     "right",
@@ -30,6 +31,7 @@ Outcome = Literal[
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 # Those that say that something is wrong.
 _ACCUSING = ("suspect, right", "suspect, wrong", "wrong though suspected", "named", "misnamed")
+NO_FAULT = "no fault"
 # Sessions that a violation is made simpler in, at the most.
 MAX_SHRINKING = 20
 
@@ -37,7 +39,8 @@ MAX_SHRINKING = 20
 class SeedReport(NamedTuple):
     """What became of a seed.
 
-    modules, network, faults, physics, expects: the session, so that it can be run again. kinds: of faults.
+    modules, network, faults, physics, expects: the session, so that it can be run again. kinds: of the faults
+    that had begun by its end.
     outcome: the right robot with exit code 0, or one whose claims are so wide that it says little; a result
     called suspect that is right within its claims, that is wrong, or that is wrong where none of its
     suspicions is; an error that names what may have happened, or accuses a healthy module; stopped with its
@@ -123,18 +126,19 @@ def _judged(schedule: Schedule) -> SeedReport:
             ending = run_schedule(schedule, Path(folder) / "run", witness)
         except RobotError as error:
             # Not of the coordinator, whose errors are endings.
-            ending = Ending(type(error).__name__, str(error))
+            ending = Ending(type(error).__name__, str(error), witness.seen_until_ns / NS_PER_S)
             violations["agent died"] = str(error)
         except Exception as error:
-            ending = Ending(type(error).__name__, str(error))
+            ending = Ending(type(error).__name__, str(error), witness.seen_until_ns / NS_PER_S)
             violations["traceback"] = _described(error)
         if logged:
             violations.setdefault("traceback", f"logged: {_described(logged[0])}")
         checked = check_folder(Path(folder) / "run", ending)
         violations |= witness.violations | checked.violations
-    outcome = "violation" if violations else _outcome(schedule, ending, checked)
+    begun = tuple(fault for fault in schedule.faults if fault.begins_s <= ending.at_s)
+    # What was still to come has done nothing.
+    outcome = "violation" if violations else _outcome(schedule._replace(faults=begun), ending, checked)
     serials = schedule.robot.serials
-    begun = [fault for fault in schedule.faults if fault.begins_s <= ending.at_s]
     named = any(fault.is_named(ending.text, serials) for fault in begun)
     return SeedReport(
         seed=schedule.seed,
@@ -142,7 +146,7 @@ def _judged(schedule: Schedule) -> SeedReport:
         modules=len(serials),
         network=schedule.network,
         faults=tuple(map(str, schedule.faults)),
-        kinds=tuple(fault.kind for fault in schedule.faults),
+        kinds=tuple(fault.kind for fault in begun),
         ending=ending.name,
         text=ending.text,
         outcome=outcome,
@@ -186,9 +190,12 @@ def _simplest(schedule: Schedule, report: SeedReport) -> SeedReport:
 
 
 def by_fault(reports: Sequence[SeedReport]) -> dict[str, Counter[str]]:
-    """Return how often each outcome followed on each kind of fault; a seed counts for each of its kinds."""
-    counted: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
+    """Return how often each outcome followed on each kind of fault; a seed counts for each of its kinds.
+
+    A fault that had not begun counts for none of them, and a seed without any as one without faults.
+    """
+    counted: dict[str, Counter[str]] = {kind: Counter() for kind in (*KINDS, NO_FAULT)}
     for report in reports:
-        for kind in set(report.kinds):
+        for kind in set(report.kinds) or (NO_FAULT,):
             counted[kind][report.outcome] += 1
     return counted

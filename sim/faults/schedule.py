@@ -27,7 +27,8 @@ SMALL_ROBOTS = (
     ("tree_y", 3),
 )
 NETWORKS = ("none", "lan", "wifi")
-# A session of two joints takes 15 s; a fault after its end is none.
+# A session of two joints takes 15 s. Where another fault ends it before, those that were to come have not
+# begun, and count for nothing.
 LATEST_S = 14.0
 # The share of sessions whose coordinator is told how many modules there are, as most users would.
 EXPECTING = 0.75

@@ -1,6 +1,7 @@
 """`x5-sim faults` says what was violated, and how to see it again."""
 
 import json
+import math
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from sim.benchmark.case import Trial
 from sim.benchmark.workers import run_trial
 from sim.commands import faults
 from sim.faults import report
+from sim.faults.fault import Fault
 from sim.faults.invariants import Claim, FolderCheck
 from sim.faults.plant_witness import PlantWitness
 from sim.faults.report import run_seed
@@ -63,6 +65,43 @@ def test_a_violation_is_made_simpler_and_its_command_repeats_it(tmp_path: Path) 
     whole = next(one for one in found.output.splitlines() if "repeat it with:" in one)
     repeated = runner.invoke(app, shlex.split(whole.partition("x5-sim ")[2]))
     assert whole in repeated.output
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_fault_that_had_not_begun_as_its_session_ended_counts_for_none_of_its_kind(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    document = tmp_path / "faults.json"
+    serial = draw(7).robot.serials[1]
+    monkeypatch.setattr(report, "run_schedule", lambda *of: Ending("ModuleLost", f"module {serial}", 5.0))
+    early, late = (
+        "agent crash of module {} from {}.000 s on, size 0.500".format(*of) for of in ((0, 4), (1, 6))
+    )
+    options = ["faults", "--seeds", "7..7", "--fault", late, "--json", str(document)]
+    # Accused is a module to which nothing had happened yet, and then one to which it had.
+    for given, counted, words in (
+        ([], {"no fault": {"misnamed": 1}}, "1 of 1 faults had not begun"),
+        (["--fault", early], {"agent crash": {"misnamed": 1}}, "1 of 2 faults had not begun"),
+        (["--fault", late.replace("6.", "3.")], {"agent crash": {"named": 1}}, "1 of 2 faults had not begun"),
+    ):
+        found = CliRunner().invoke(app, [*options, *given])
+        assert words in found.output
+        by_fault = json.loads(document.read_text())["by_fault"]
+        assert {kind: counts for kind, counts in by_fault.items() if counts} == counted
+
+
+def test_of_a_session_that_ends_with_a_traceback_the_time_is_what_the_plant_has_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending:
+        witness.seen_until_ns = 5_000_000_000
+        raise KeyError("X")
+
+    monkeypatch.setattr(report, "run_schedule", run_schedule)
+    schedule = draw(7)._replace(
+        faults=(Fault("agent crash", 4.0, math.inf, 0), Fault("agent freeze", 6.0, math.inf, 0))
+    )
+    assert run_seed(schedule, shrinks=False).kinds == ("agent crash",)
 
 
 @pytest.mark.usefixtures("in_this_process")
