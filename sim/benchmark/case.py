@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -16,7 +16,8 @@ class Trial(NamedTuple):
     cost_s: approximate duration; long trials start first, so that all processes end together.
     shares: trials of the same name run one after the other in one process, which keeps what they have in
         common; none by default.
-    limit_s: after this time it is given up, and counts as failed; a cluster has no such limit.
+    limit_s: after this time it is given up, and counts as failed. A cluster does not tell when a trial
+        begins: what is left is given up when none has ended for that long.
     """
 
     work: Callable[..., Any]
@@ -27,9 +28,10 @@ class Trial(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """The result of a trial that raised; `text` describes the exception."""
+    """The result of a trial that raised, hung, or whose process died; `text` describes it."""
 
     text: str
+    how: Literal["raised", "hung", "died"] = "raised"
 
 
 class Summary(NamedTuple):

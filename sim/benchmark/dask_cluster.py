@@ -1,5 +1,6 @@
 """Trials on a Dask cluster: the workers of several machines, each of which has this project installed."""
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,6 +9,8 @@ from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trial
 
 CONNECT_S = 10.0
+# Between looks whether a trial has ended.
+LOOK_S = 0.05
 
 
 def run_trials_on(
@@ -16,7 +19,8 @@ def run_trials_on(
     """Run trials on the cluster of a Dask scheduler and return their results in order.
 
     `on_done` receives index and result of each as it ends. A trial that raises, or whose workers the cluster
-    loses again and again, gives `Failed`.
+    loses again and again, gives `Failed`, and so do all that are left when none has ended within the longest
+    of their `limit_s`.
 
     Raises:
         UsageError: the library is not installed, or no scheduler is at the address.
@@ -34,11 +38,26 @@ def run_trials_on(
         futures = client.map(run_trial, list(trials), pure=False)
         place = {future.key: index for index, future in enumerate(futures)}
         results: list[Any] = [None] * len(trials)
-        for future in as_completed(futures):  # type: ignore[no-untyped-call]
-            index = place[future.key]
+        limit_s = max((trial.limit_s for trial in trials), default=0.0)
+
+        def end(future: Any, result: Any) -> None:
+            index = place.pop(future.key)
+            results[index] = result
+            on_done(index, result)
+
+        ended, last_s = as_completed(futures), time.monotonic()  # type: ignore[no-untyped-call]
+        while place and time.monotonic() - last_s <= limit_s:
+            if not ended.has_ready():  # type: ignore[no-untyped-call]
+                time.sleep(LOOK_S)
+                continue
+            future, last_s = next(ended), time.monotonic()
             if future.status == "finished":
-                results[index] = future.result()
+                end(future, future.result())
             else:
-                results[index] = Failed(f"the cluster at {address} lost it: {future.exception()}")
-            on_done(index, results[index])
+                end(future, Failed(f"the cluster at {address} lost it: {future.exception()}", "died"))
+        for future in futures:
+            if future.key in place:
+                future.cancel()  # type: ignore[no-untyped-call]
+                text = f"it hangs: nothing had ended for {limit_s:g} s on the cluster at {address}"
+                end(future, Failed(text, "hung"))
         return results

@@ -124,7 +124,8 @@ class _Worker:
         try:
             found = Done(*self.pipe.recv())
         except (EOFError, OSError):
-            found = Done(Failed(f"the worker process died with exit code {self._exit_code()}"), 0.0)
+            text = f"the worker process died with exit code {self._exit_code()}"
+            found = Done(Failed(text, "died"), 0.0)
             self.end()
         if self._left_s <= 0.0 and not self.next:
             self.end()
@@ -135,7 +136,7 @@ class _Worker:
         self.end()
         index, self._index = self._index, None
         assert index is not None
-        return index, Done(Failed(f"it hangs: it had not ended after {self._limit_s:g} s"), 0.0)
+        return index, Done(Failed(f"it hangs: it had not ended after {self._limit_s:g} s", "hung"), 0.0)
 
     def end(self) -> None:
         """End the process, at once if it is at work."""

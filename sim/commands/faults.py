@@ -20,7 +20,7 @@ from sim.commands.experiment import experiment, worker_count
 from sim.commands.options import load
 from sim.faults.fault import Fault, fault_of
 from sim.faults.invariants import NO_LINK, VAGUE_DEG, VAGUE_MM
-from sim.faults.report import OUTCOMES, SeedReport, by_fault, run_seed
+from sim.faults.report import OUTCOMES, SeedReport, by_fault, lost_seed, run_seed
 from sim.faults.schedule import Schedule, draw, first_modules
 from sim.physics.engine import Physics
 from sim.thesis.experiment import Unit
@@ -67,7 +67,8 @@ def faults(
 ) -> None:
     """Run sessions with faults in virtual time and judge them by the truth of the plant.
 
-    Exit code 0 if no invariant is violated, 4 if one is, 2 for wrong usage, 130 if interrupted.
+    Exit code 0 if no invariant is violated, 4 if one is or a seed hangs or dies, 2 for wrong usage, 130 if
+    interrupted.
     """
     numbers = seed_range(seeds)
     schedules = [
@@ -77,23 +78,23 @@ def faults(
         Unit(f"seed {one.seed}", run_seed, (one, shrink), kind=SeedReport, cost_s=COST_S) for one in schedules
     ]
     outcomes = _run(units, None if out is None else Store(out), workers, dask)
-    reports = [one for one in outcomes if isinstance(one, SeedReport)]
-    if write_result(json_file, figures(numbers, outcomes)):
+    reports = [
+        lost_seed(schedule, one.how, one.text) if isinstance(one, Failed) else one
+        for schedule, one in zip(schedules, outcomes, strict=True)
+    ]
+    if write_result(json_file, figures(numbers, reports)):
         _print_table(reports)
-    violated = 0
-    for seed, one in zip(numbers, outcomes, strict=True):
-        if isinstance(one, Failed):
-            typer.echo(f"seed {seed}: {one.text}", err=True)
-            violated += 1
-        elif one.violations:
-            typer.echo(described(one, robot), err=True)
-            violated += 1
+    violated = [one for one in reports if one.violations]
+    for one in violated:
+        typer.echo(described(one, robot), err=True)
+    lost = Counter(one.outcome for one in violated if one.outcome != "violation")
+    others = "".join(f", {count} {how}" for how, count in lost.items())
     drawn, begun = sum(len(one.faults) for one in reports), sum(len(one.kinds) for one in reports)
     named = [one.named_rightly for one in reports if one.named_rightly is not None]
     typer.echo(
-        f"{len(numbers)} seeds, {violated} with violations; {sum(named)} of {len(named)} errors and "
-        f"suspicions name what happened; {drawn - begun} of {drawn} faults had not begun when their session "
-        "ended",
+        f"{len(numbers)} seeds, {len(violated) - lost.total()} with violations{others}; {sum(named)} of "
+        f"{len(named)} errors and suspicions name what happened; {drawn - begun} of {drawn} faults had not "
+        "begun when their session ended",
         err=json_file == STANDARD_OUTPUT,
     )
     wrong = [one for one in reports if one.outcome == "wrong though suspected"]
@@ -148,13 +149,11 @@ def claimed(reports: Sequence[SeedReport]) -> str:
     )
 
 
-def figures(seeds: range, outcomes: Sequence[Any]) -> dict[str, Any]:
+def figures(seeds: range, reports: Sequence[SeedReport]) -> dict[str, Any]:
     """Return the contents of the JSON file."""
-    reports = [one for one in outcomes if isinstance(one, SeedReport)]
     return {
         "seeds": [seeds.start, seeds.stop - 1],
         "by_fault": {kind: dict(counted) for kind, counted in by_fault(reports).items()},
-        "failed": {s: one.text for s, one in zip(seeds, outcomes, strict=True) if isinstance(one, Failed)},
         "reports": [_document(one) for one in reports],
     }
 

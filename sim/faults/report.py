@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple, get_args
 
 from module_agent.model.errors import RobotError
-from sim.faults.fault import KINDS
+from sim.faults.fault import KINDS, Fault
 from sim.faults.invariants import Claim, FolderCheck, check_folder, is_misnamed
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import Schedule, simpler
@@ -27,6 +27,9 @@ Outcome = Literal[
     "misnamed",
     "stopped",
     "violation",
+    "hung",
+    "died",
+    "raised",
 ]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 # Those that say that something is wrong.
@@ -44,7 +47,7 @@ class SeedReport(NamedTuple):
     outcome: the right robot with exit code 0, or one whose claims are so wide that it says little; a result
     called suspect that is right within its claims, that is wrong, or that is wrong where none of its
     suspicions is; an error that names what may have happened, or accuses a healthy module; stopped with its
-    coordinator killed; or a violation of an invariant.
+    coordinator killed; or a violation of an invariant. A seed hung, its process died, or the judge raised.
     named_rightly: whether an error or a suspicion names a fault that had begun, None without either.
     simplest: the simplest session found that violates the same invariant, None if none was looked for.
     claim: the widest of the right robot; None without one. wrong: what is wrong with a suspect one.
@@ -76,6 +79,11 @@ class SeedReport(NamedTuple):
             f"--seeds {self.seed}..{self.seed} --robot {robot or self.robot} --modules {self.modules} "
             f"--network {self.network}{engine} {expect}{faults}"
         )
+
+
+def lost_seed(schedule: Schedule, how: Literal["hung", "died", "raised"], text: str) -> SeedReport:
+    """Return the report of a session of which nothing came back: all of its faults count as begun."""
+    return _report(schedule, schedule.faults, Ending(how, text), how, {how: text})
 
 
 def run_seed(schedule: Schedule, shrinks: bool = True) -> SeedReport:
@@ -138,12 +146,21 @@ def _judged(schedule: Schedule) -> SeedReport:
     begun = tuple(fault for fault in schedule.faults if fault.begins_s <= ending.at_s)
     # What was still to come has done nothing.
     outcome = "violation" if violations else _outcome(schedule._replace(faults=begun), ending, checked)
-    serials = schedule.robot.serials
-    named = any(fault.is_named(ending.text, serials) for fault in begun)
+    named = any(fault.is_named(ending.text, schedule.robot.serials) for fault in begun)
+    return _report(schedule, begun, ending, outcome, violations)._replace(
+        claim=checked.claim if outcome in ("right", "vague") else None,
+        wrong=checked.wrong,
+        named_rightly=named if outcome in _ACCUSING else None,
+    )
+
+
+def _report(
+    schedule: Schedule, begun: Sequence[Fault], ending: Ending, outcome: Outcome, violations: dict[str, str]
+) -> SeedReport:
     return SeedReport(
         seed=schedule.seed,
         robot=schedule.robot.name,
-        modules=len(serials),
+        modules=len(schedule.robot.modules),
         network=schedule.network,
         faults=tuple(map(str, schedule.faults)),
         kinds=tuple(fault.kind for fault in begun),
@@ -153,9 +170,6 @@ def _judged(schedule: Schedule) -> SeedReport:
         violations=violations,
         physics=schedule.physics,
         expects=schedule.expects,
-        claim=checked.claim if outcome in ("right", "vague") else None,
-        wrong=checked.wrong,
-        named_rightly=named if outcome in _ACCUSING else None,
     )
 
 

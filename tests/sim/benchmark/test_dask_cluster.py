@@ -1,7 +1,9 @@
 """A Dask cluster returns what worker processes return."""
 
 import math
+import os
 import socket
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -10,7 +12,7 @@ from module_agent.model.errors import UsageError
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.dask_cluster import run_trials_on
 
-distributed = pytest.importorskip("distributed")
+dask, distributed = (pytest.importorskip(name) for name in ("dask", "distributed"))
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,27 @@ def test_results_come_in_the_order_of_the_trials_and_what_raises_is_named(addres
     assert isinstance(results[5], Failed)
     assert "ValueError" in results[5].text
     assert done == dict(enumerate(results))
+
+
+def test_what_is_left_is_given_up_when_nothing_ends_any_more(address: str) -> None:
+    done: dict[int, object] = {}
+    trials = [Trial(math.sqrt, (4.0,), limit_s=0.5), Trial(time.sleep, (3.0,), limit_s=0.5)]
+    results = run_trials_on(address, trials, done.__setitem__)
+    text = f"it hangs: nothing had ended for 0.5 s on the cluster at {address}"
+    assert results == [2.0, Failed(text, "hung")]
+    assert done == dict(enumerate(results))
+
+
+def test_a_trial_whose_worker_dies_has_died() -> None:
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(host="127.0.0.1", protocol="tcp", **options) as cluster,
+    ):
+        # os._exit ends a process as a crash does: nothing is said.
+        (result,) = run_trials_on(cluster.scheduler_address, [Trial(os._exit, (7,))])
+    assert isinstance(result, Failed)
+    assert result.how == "died"
 
 
 def test_an_address_without_a_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

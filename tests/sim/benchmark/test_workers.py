@@ -43,13 +43,13 @@ def test_a_trial_that_raises_says_what_and_the_others_go_on() -> None:
 def test_a_worker_that_dies_takes_its_trial_along_and_is_replaced() -> None:
     # os._exit ends a process as a crash does: nothing is said.
     first, second = results([Trial(os._exit, (7,), cost_s=2.0), Trial(math.sqrt, (4.0,))], 1)
-    assert first == Failed("the worker process died with exit code 7")
+    assert first == Failed("the worker process died with exit code 7", "died")
     assert second == 2.0
 
 
 def test_a_trial_that_hangs_is_given_up_and_the_others_go_on() -> None:
     trials = [Trial(time.sleep, (3600.0,), limit_s=0.5), Trial(math.sqrt, (4.0,))]
-    assert results(trials, 1) == [Failed("it hangs: it had not ended after 0.5 s"), 2.0]
+    assert results(trials, 1) == [Failed("it hangs: it had not ended after 0.5 s", "hung"), 2.0]
     assert not multiprocessing.active_children()
 
 

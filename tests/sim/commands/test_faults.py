@@ -5,13 +5,13 @@ import math
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from typer.testing import CliRunner
 
 from module_agent.model.errors import EXIT_FINDING, EXIT_INTERRUPTED, EXIT_USAGE
-from sim.benchmark.case import Trial
+from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trial
 from sim.commands import faults
 from sim.faults import report
@@ -139,6 +139,31 @@ def test_results_that_are_not_plainly_right_have_columns_of_their_own(
     )
     CliRunner().invoke(app, [*options, "--json", str(document)])
     assert json.loads(document.read_text())["reports"][0]["outcome"] == outcome
+
+
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize("how", ["hung", "died", "raised"])
+def test_a_seed_of_which_nothing_came_back_is_in_the_table_with_the_command_that_repeats_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: Literal["hung", "died", "raised"]
+) -> None:
+    def lose_the_first(trials: list[Trial], workers: int, on_done: Callable[[int, Any], None]) -> None:
+        on_done(0, Failed("no word of it", how))
+        on_done(1, run_trial(trials[1]))
+
+    monkeypatch.setattr(faults, "run_trials", lose_the_first)
+    document = tmp_path / "faults.json"
+    found = CliRunner().invoke(app, ["faults", "--seeds", "7..8", "--out", str(tmp_path / "kept")])
+    assert found.exit_code == EXIT_FINDING
+    assert f"seed 7: {how}: no word of it" in found.output
+    (line,) = (line for line in found.output.splitlines() if "repeat it with:" in line)
+    assert "--seeds 7..7" in line
+    assert f"2 seeds, 0 with violations, 1 {how}; " in found.output
+    assert any("all seeds" in line and line.count("1") == 2 for line in found.output.splitlines())
+    # It is not kept: the same command runs it again.
+    monkeypatch.setattr(faults, "run_trials", one_after_another)
+    again = ["faults", "--seeds", "7..8", "--out", str(tmp_path / "kept"), "--json", str(document)]
+    assert CliRunner().invoke(app, again).exit_code == 0
+    assert [one["outcome"] for one in json.loads(document.read_text())["reports"]] == ["right", "right"]
 
 
 @pytest.mark.usefixtures("in_this_process")
