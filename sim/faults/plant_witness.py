@@ -111,6 +111,8 @@ class PlantWitness:
         self._setpoints: dict[str, dict[float, str]] = {}
         self._leases: dict[str, _Held] = {}
         self._usual: _Usual | None = None
+        # The motors' speeds in the last tick.
+        self._speeds: Array | None = None
 
     def tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
         """Note who commands which module, and what that accepts; a `Tap` of the virtual network.
@@ -226,12 +228,15 @@ class PlantWitness:
         elif any(self._outward_rad.values()):
             self._outward_rad = dict.fromkeys(self._ranges, 0.0)
         self._check_heat(robot, seen[:, PLANT_PWM])
+        speeds, last = seen[:, PLANT_MOTOR_RAD_S], self._speeds
         for k, module in enumerate(robot.robot.modules):
-            driven = seen[:, (PLANT_PWM, PLANT_MOTOR_RAD_S), k]
+            pwm = seen[:, PLANT_PWM, k]
             if module.serial in self._stopped_ns:
-                self._check_stopped(module.serial, module_type(module.type), first_ns, driven)
+                read = np.append(speeds[0, k] if last is None else last[k], speeds[:-1, k])
+                self._check_stopped(module.serial, module_type(module.type), first_ns, pwm, read)
             else:
-                self._check_late(module.serial, first_ns, driven[:, 0])
+                self._check_late(module.serial, first_ns, pwm)
+        self._speeds = speeds[-1].copy()
 
     def _usual_of(self, robot: VirtualRobot) -> "_Usual":
         """Return what no check finds anything in."""
@@ -326,17 +331,21 @@ class PlantWitness:
         text = f"PWM {pwm[tick]:.3f}, {(t_ns - ended_ns) / 1e6:.0f} ms after its lifetime ended"
         self._note("driven too late", f"module {serial} at {t_ns / 1e9:.3f} s: {text}")
 
-    def _check_stopped(self, serial: str, kind: ModuleType, first_ns: int, driven: Array) -> None:
-        """Judge a motor, PWM and speed (T, 2), from two ticks after a stop on: it is off, or it brakes.
+    def _check_stopped(self, serial: str, kind: ModuleType, first_ns: int, pwm: Array, speed: Array) -> None:
+        """Judge a motor from two ticks after a stop on: it is off, or it brakes.
 
-        The brake follows the motor's speed, which a spring keeps apart from the output's. Before a limit of
-        its position it is harder than elsewhere, and never harder than what the speed alone would induce.
+        The brake follows the motor's speed, which a spring keeps apart from the output's, as it was read in
+        the tick before: a spring changes it by tenths of rad/s in one. Before a limit of its position it is
+        harder than elsewhere, and never harder than what the speed alone would induce.
+
+        Args:
+            pwm, speed: of ticks (T,); each speed is that of the tick before.
         """
         stopped_ns = self._stopped_ns[serial]
         begin = max((stopped_ns - first_ns) // TICK_NS + 2, 0)
-        if begin >= len(driven) or not driven[begin:, 0].any():
+        if begin >= len(pwm) or not pwm[begin:].any():
             return
-        pwm, speed = driven[begin:].T
+        pwm, speed = pwm[begin:], speed[begin:]
         hardest = np.maximum(DAMPING_LIMIT_PWM, SPEED_MARGIN * np.abs(speed) / kind.max_speed_rad_s)
         brakes = (np.abs(pwm) <= hardest) & ((np.abs(speed) < SLOW_RAD_S) | (pwm * speed <= 0.0))
         wrong = (pwm != 0.0) & ~brakes

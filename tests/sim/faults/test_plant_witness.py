@@ -81,8 +81,8 @@ class Scene:
 
     def judged(self, pwm: float, speed_rad_s: float) -> set[str]:
         """Return what the witness notes of a motor that is driven after the lifetime of the last command."""
-        seen = np.zeros((1, SEEN_ROWS, 1))
-        seen[0, [PLANT_PWM, ASKED]], seen[0, PLANT_MOTOR_RAD_S] = pwm, speed_rad_s
+        seen = np.zeros((2, SEEN_ROWS, 1))
+        seen[:, [PLANT_PWM, ASKED]], seen[:, PLANT_MOTOR_RAD_S] = pwm, speed_rad_s
         return self.looked(seen, self.now_ns + LATE_NS)
 
     def looked(self, seen: np.ndarray, from_ns: int) -> set[str]:
@@ -162,6 +162,23 @@ def test_a_module_that_has_accepted_a_stop_brakes_from_two_ticks_after_it() -> N
         seen[: last + 1, PLANT_PWM] = 0.2
         seen[:, PLANT_MOTOR_RAD_S] = 0.5
         assert scene.looked(seen, scene.now_ns) == found
+
+
+@pytest.mark.parametrize("split", [0, 4])
+def test_a_brake_opposes_the_speed_that_the_module_has_read_a_tick_before(split: int) -> None:
+    """A spring turns the motor about within a tick, as seed 8 found; in one call or in two."""
+    seen = np.zeros((8, SEEN_ROWS, 1))
+    seen[:4, PLANT_MOTOR_RAD_S], seen[4:, PLANT_MOTOR_RAD_S] = -0.1, 0.18
+    for turns, found in ((4, set()), (5, {"driven after a stop"})):
+        scene = armed()
+        scene.accept(Leaf.STOP)
+        at_ns = scene.now_ns + 10 * MS
+        seen[:, PLANT_PWM] = -0.1
+        seen[: turns + 1, PLANT_PWM] = 0.1
+        for first, end in ((0, split), (split, 8)):
+            if end > first:
+                scene.looked(seen[first:end], at_ns + first * MS)
+        assert set(scene.witness.violations) == found
 
 
 def test_a_second_stop_gives_no_more_time_to_brake() -> None:
