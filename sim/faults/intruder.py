@@ -91,12 +91,13 @@ class Intruder:
 
     def poison(self) -> None:
         """Publish statuses of a module that cannot be, and of a motion without end."""
-        own = key(self._robot, self._serial, Leaf.STATUS)
         record = {"motion_id": 1, "pattern": {"kind": "rest", "duration_s": 1.0}, "outcome": "running"}
         rows = {"start_ns": 0, "start_row": 0, "end_row": HUGE, "origin_rad": 0.0}
-        for wrong in ({"serial": "-bad"}, {"next_row": HUGE}, {"motion": record | rows}, {"t_ns": -HUGE}):
-            self._publish(own, self._status | wrong)
-        self._publish(f"{ROOT}/{self._robot}/-bad/{Leaf.STATUS.value}", self._status | {"serial": "-bad"})
+        # Coordinators hear the one key, the other modules the other.
+        for leaf in (Leaf.STATUS, Leaf.MOTION):
+            for wrong in ({"serial": "-bad"}, {"next_row": HUGE}, {"motion": record | rows}, {"t_ns": -HUGE}):
+                self._publish(key(self._robot, self._serial, leaf), self._status | wrong)
+            self._publish(f"{ROOT}/{self._robot}/-bad/{leaf.value}", self._status | {"serial": "-bad"})
 
     def impersonate(self) -> None:
         """Command in the holder's name, as a module publishes it, what the module's limits allow.

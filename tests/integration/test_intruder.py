@@ -4,12 +4,14 @@ That the attacks are real is shown by the positive controls of `tests/module_age
 test_credentials.py`: without `--secure` they succeed where nothing on the network tells who spoke.
 """
 
+import resource
 import time
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 import zenoh
@@ -25,7 +27,7 @@ from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, Feedback, LeaseRequest, Setpoint, Status, Stop
 from module_agent.wire.refusal import WireError
-from sim.faults.intruder import Intruder
+from sim.faults.intruder import HUGE, Intruder
 from sim.faults.invariants import RESOLUTION_MM, SIGMAS
 from sim.scoring.score import score
 from sim.world.truth import read_motion
@@ -52,6 +54,12 @@ def at(endpoint: str) -> tuple[str, ...]:
 def list_modules(programs, endpoint: str, folder: Path) -> Any:
     options = (*at(endpoint), "--secure", str(folder), "--expect", "2")
     return programs.run("coordinator.main", "list", *options)
+
+
+def resident_mb(pid: int) -> float:
+    """Return how much memory a process has."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return 1e-6 * pages * resource.getpagesize()
 
 
 def start_hub(robot, programs) -> Any:
@@ -244,18 +252,31 @@ def test_without_security_false_rows_become_those_of_the_module(launcher, client
     assert np.sum(accel > 1.5 * G_M_S2) >= 15
 
 
+def lie(module, status: bytes) -> None:
+    """Publish as the module that one is, with a certificate: a motion without end, numbers out of range."""
+    record = {"motion_id": 1, "pattern": {"kind": "rest", "duration_s": 1.0}, "outcome": "running"}
+    rows = {"start_ns": 0, "start_row": 0, "end_row": HUGE, "origin_rad": 0.0}
+    whole = {"start_ns": 0, "start_row": 0, "end_row": 90_000, "origin_rad": 0.0, "outcome": "done"}
+    lies = {"motion": record | rows}, {"motion": record | whole}, {"next_row": HUGE}, {"t_ns": -HUGE}
+    for leaf in (Leaf.STATUS, Leaf.MOTION):
+        for wrong in lies:
+            told = msgpack.unpackb(status) | {"serial": "INTRUDER"} | wrong
+            module.publish(key(ROBOT, "INTRUDER", leaf), msgpack.packb(told))
+
+
 def test_with_security_the_robot_identifies_itself_among_intruders(
     secured, programs, endpoint, tmp_path
 ) -> None:
     """An observer and a hostile module with a certificate attack all the time; nothing of it arrives.
 
-    Others, without a certificate or with one of another authority, are not let in.
+    What the module says as itself does arrive, and harms nobody. Others, without a certificate or with one of
+    another authority, are not let in.
     """
     robot, folder = secured
     serial = robot.config.serials[0]
     robot.start_world()
     coordinator = start_hub(robot, programs)
-    robot.start_agents()
+    agents = robot.start_agents()
     programs.until(
         lambda: list_modules(programs, endpoint, folder).returncode == 0, "the modules", coordinator
     )
@@ -290,12 +311,16 @@ def test_with_security_the_robot_identifies_itself_among_intruders(
             one.query(key(ROBOT, serial, Leaf.LEASE), latest, 0.1, lambda event: None, 1)
         for forger in forgers:
             forger.publish()
+        lie(hostile[0], latest)
         time.sleep(0.02)
     code, text = programs.ended(coordinator)
     for one in hostile:
         one.close()
     assert code == 0, text
     assert not leases(answered)
+    for agent in agents:
+        assert agent.process.poll() is None
+        assert resident_mb(agent.process.pid) < 400.0
     robot.stop()
     result = score(robot.config.out)
     assert result.topology_correct
