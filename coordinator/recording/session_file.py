@@ -50,7 +50,8 @@ _FOOTER = struct.Struct("<QQI")
 _DATA_END_BYTES = 4
 _MAX_CHUNK_BYTES = 1 << 30
 _OPCODES = frozenset(map(int, Opcode))
-_UNREADABLE = (McapError, ZstdError, EndOfFile, struct.error, ValueError, MemoryError)
+# A length of more than 63 bits overflows.
+_UNREADABLE = (McapError, ZstdError, EndOfFile, struct.error, ValueError, MemoryError, OverflowError)
 
 KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
 

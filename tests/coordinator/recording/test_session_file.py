@@ -184,6 +184,19 @@ def test_damage_names_the_place_and_the_time(tmp_path: Path, wire: SimpleNamespa
     assert 2.0 < after_s < 6.0
 
 
+def test_a_length_beyond_any_file_is_damage(tmp_path: Path, wire: SimpleNamespace) -> None:
+    path, entries = tmp_path / "session.mcap", _entries(wire, 400)
+    _write(path, entries).close()
+    content = bytearray(path.read_bytes())
+    held_at = content.index(b"zstd") + 4
+    content[held_at - 4 : held_at + 8] = b"none" + (2**63).to_bytes(8, "little")
+    path.write_bytes(content)
+    reports: list[str] = []
+    read = list(read_session(path, reports.append))
+    assert len(reports) == 1
+    assert 360 <= len(read) < 400
+
+
 def test_closing_twice_is_once(tmp_path: Path, wire: SimpleNamespace) -> None:
     writer = _write(tmp_path / "session.mcap", _entries(wire, 10))
     writer.close()
