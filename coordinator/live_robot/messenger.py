@@ -4,6 +4,7 @@ Clock and event loop are arguments, so that the same code runs in real and in vi
 """
 
 import asyncio
+from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from typing import NamedTuple
 
@@ -85,6 +86,8 @@ class Messenger:
         self._post = post
         self._record = record
         self._inbox = Inbox(MAX_MESSAGE_BYTES, LANE_BYTES, INBOX_BYTES)
+        # Taken out of the inbox, and not handled yet.
+        self._taken: deque[tuple[int, Event]] = deque()
         self._draining = False
         self._closed = False
         self._pending: dict[int, asyncio.Future[tuple[Reply, int]]] = {}
@@ -128,14 +131,20 @@ class Messenger:
         self._draining = False
         begun_ns = self._cpu_clock() if self._cpu_clock is not None else 0
         # A few at a time: after a stall the keep-alives that are due must not wait for the whole inbox.
-        for t_ns, event in self._inbox.drain_stamped(limit=32):
-            self._received += 1
-            self._handle(event, t_ns)
-        if self._cpu_clock is not None:
-            self._cpu_ns += self._cpu_clock() - begun_ns
-        if self._inbox.waiting and not self._draining:
-            self._draining = True
-            self._post(self._drain)
+        if not self._taken:
+            self._taken.extend(self._inbox.drain_stamped(limit=32))
+        try:
+            while self._taken:
+                self._received += 1
+                t_ns, event = self._taken.popleft()
+                self._handle(event, t_ns)
+        finally:
+            # After an error too: the answers behind what could not be recorded are waited for.
+            if self._cpu_clock is not None:
+                self._cpu_ns += self._cpu_clock() - begun_ns
+            if (self._taken or self._inbox.waiting) and not self._draining:
+                self._draining = True
+                self._post(self._drain)
 
     def _handle(self, event: Event, t_ns: int) -> None:
         if self._closed:
@@ -173,9 +182,11 @@ class Messenger:
         tag = self._tag
         future: asyncio.Future[tuple[Reply, int]] = asyncio.get_running_loop().create_future()
         self._pending[tag] = future
-        self._record(Entry("request", topic, self._clock(), payload))
-        self._transport.query(topic, payload, timeout_s, self._sink, tag)
         try:
+            sent_ns = self._clock()
+            # First: whatever becomes of the recording, a stop goes out. Its answer waits for the event loop.
+            self._transport.query(topic, payload, timeout_s, self._sink, tag)
+            self._record(Entry("request", topic, sent_ns, payload))
             reply, t_ns = await future
         finally:
             self._pending.pop(tag, None)

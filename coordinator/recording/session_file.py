@@ -31,7 +31,7 @@ from pydantic import BaseModel
 from zstandard import ZstdError
 
 from coordinator.recording.journal import JournalEvent
-from coordinator.recording.recording import Entry, Kind
+from coordinator.recording.recording import MAX_MODULES, Entry, Kind
 from module_agent.model.errors import RobotError, UsageError
 from module_agent.wire.keys import parse
 from module_agent.wire.messages import Ack
@@ -39,6 +39,9 @@ from module_agent.wire.topics import TOPICS
 
 CHUNK_BYTES = 64 * 1024
 FLUSH_NS = 200_000_000
+# Channels are numbered in 16 bits, from 1. Anybody may publish under made-up serials: beyond `MAX_MODULES`
+# only modules that were asked something are recorded, so that questions and answers always have channels.
+MAX_CHANNELS = 2**16 - 1
 MCAP0_MAGIC = b"\x89MCAP0\r\n"
 # A record: its opcode, its length, its content. A chunk's content has 28 bytes before its compression.
 _HEAD = struct.Struct("<BQ")
@@ -74,12 +77,14 @@ class SessionWriter:
     """Appends entries to a new file, of `max_bytes` at most.
 
     When nothing more can be written, `failure` says why; what comes then is dropped, but for the journal
-    where only the limit is reached. What was written stays readable.
+    where only the limit is reached. What was written stays readable. `unrecorded` counts the entries that
+    have no place in it, of made-up modules.
     """
 
     def __init__(self, path: Path, max_bytes: int | None = None):
         self.path = path
         self.failure: NotRecorded | None = None
+        self.unrecorded = 0
         self._max_bytes = max_bytes
         self._is_broken = False
         self._file = path.open("wb")
@@ -88,15 +93,28 @@ class SessionWriter:
         self._writer.start(profile="x5", library="x5-coordinator")
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[Kind, str], int] = {}
+        self._serials: set[str] = set()
 
-    def write(self, entry: Entry) -> None:
-        """Append one entry."""
+    def write(self, entry: Entry) -> bool:
+        """Append one entry; return False if it is left out, as it is of one module too many."""
+        if not self._has_room(entry.kind, entry.topic):
+            self.unrecorded += 1
+            return False
         if self._is_broken or (self.failure is not None and entry.kind != "journal"):
-            return
+            return True
         try:
             self._write(entry)
         except OSError as error:
             self._break(error)
+        return True
+
+    def _has_room(self, kind: Kind, topic: str) -> bool:
+        if (kind, topic) in self._channels:
+            return True
+        if len(self._channels) >= MAX_CHANNELS:
+            return False
+        is_known = kind != "publication" or parse(topic).serial in self._serials
+        return is_known or len(self._serials) < MAX_MODULES
 
     def _break(self, error: OSError) -> None:
         self._is_broken = True
@@ -136,6 +154,8 @@ class SessionWriter:
             metadata={"kind": kind},
         )
         self._channels[kind, topic] = channel
+        if kind != "journal":
+            self._serials.add(parse(topic).serial)
         return channel
 
     def close(self) -> None:

@@ -47,7 +47,7 @@ from coordinator.parameter_fit.module_parts import likely_parts
 from coordinator.parameter_fit.systematic_errors import error_directions
 from coordinator.parameter_fit.torque_sensor_scale import SCALE_SIGMA
 from coordinator.recording.journal import JournalEvent, standstill
-from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.recording.recording import JOURNAL_TOPIC, MAX_MODULES, Entry, Recording
 from coordinator.recording.run_folder import (
     CALIBRATION,
     HELD_OUT,
@@ -237,18 +237,24 @@ class Run:
     # ------------------------------------------------------------------ recording
 
     def _record(self, entry: Entry) -> Message | None:
-        self._write(entry)
+        # What a replay does not read is not part of the result either.
+        if not self._write(entry):
+            return None
         message = self.recording.accept(entry)
         if message is not None:
             self._feed.on_message(entry, message)
         return message
 
-    def _write(self, entry: Entry) -> None:
-        """Write an entry; where nothing can be recorded, end the session, which stops the robot first."""
-        self._writer.write(entry)
+    def _write(self, entry: Entry) -> bool:
+        """Write an entry, False if it is left out; where nothing can be recorded, end the session.
+
+        The session stops the robot first.
+        """
+        is_taken = self._writer.write(entry)
         if self._writer.failure is not None and self._session is not None:
             session, self._session = self._session, None
             session.cancel(str(self._writer.failure))
+        return is_taken
 
     def _journal(self, event: JournalEvent) -> None:
         entry = Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode())
@@ -419,6 +425,11 @@ class Run:
                 if self._messenger.dropped:
                     self._screen.note(
                         f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
+                    )
+                if self._writer.unrecorded:
+                    self._screen.note(
+                        f"{self._writer.unrecorded} messages were not recorded: more than {MAX_MODULES} "
+                        "serials publish, most of which are made up; see docs/security.md"
                     )
 
     async def _record_session(self) -> Kinematics | None:

@@ -19,6 +19,7 @@ from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import NotRecorded, SessionWriter
 from coordinator.session.session import NoModulesFound
 from module_agent.network_emulation.profile import NetworkProfile
+from module_agent.wire.keys import Leaf, key
 from sim.physics.engine import Physics
 from sim.scoring.score import score
 from sim.virtual_time.loop import NS_PER_S
@@ -306,3 +307,28 @@ def test_when_nothing_can_be_recorded_any_more_the_robot_is_stopped_and_it_is_sa
     kept = load_recording(tmp_path / "run" / "session.mcap")
     assert not kept.damage
     assert all(module.rows.count > 1000 for module in kept.modules.values())
+
+
+def test_messages_on_made_up_keys_neither_end_a_session_nor_keep_its_stop_back(
+    rigs: Rigs, quick_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan", 1)
+    monkeypatch.setattr("coordinator.session.run.SessionWriter", lambda path, _: _FullDisk(path))
+    monkeypatch.setattr("coordinator.recording.session_file.MAX_MODULES", 10)
+    intruder = rig.endpoint("intruder")
+
+    def publish() -> None:
+        for number in range(50):
+            for leaf in (Leaf.STATUS, Leaf.FEEDBACK):
+                intruder.publish(key(rig.robot.name, f"made-up-{number}", leaf), b"noise")
+
+    rig.at(8.0, publish)
+    with pytest.raises(NotRecorded, match="No space left on device"):
+        rig.session(tmp_path / "run", quick_plan)
+    assert {rig.state(serial) for serial in rig.serials} == {"stopped"}
+    (said,) = [line for line in rig.notes if "not recorded" in line]
+    # Two messages of each made-up module that has no place beside those of the robot.
+    assert said.startswith(f"{2 * (50 - 10 + len(rig.serials))} messages ")
+    kept = load_recording(tmp_path / "run" / "session.mcap")
+    assert not kept.damage
+    assert all(kept.modules[serial].rows.count > 1000 for serial in rig.serials)

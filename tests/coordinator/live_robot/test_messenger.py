@@ -11,7 +11,7 @@ from coordinator.live_robot.messenger import LANE_BYTES, Messenger, NoAnswer, Re
 from coordinator.recording.recording import Entry, Recording
 from module_agent.transport.inbox import EVENT_BYTES
 from module_agent.transport.transport import Request, TransportError
-from module_agent.wire.codec import encode
+from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, Message, Stop
 from module_agent.wire.refusal import WireError
@@ -189,6 +189,47 @@ def test_messages_are_recorded_with_the_time_of_their_delivery(wire: SimpleNames
     bench.loop.run_until_complete(asyncio.sleep(0.2))
     posted[0]()
     assert [entry.t_ns for entry in bench.entries] == [5_000_000]
+    bench.loop.close()
+
+
+class _Unrecordable(Exception):
+    """What the recording raises: a defect of ours."""
+
+
+def test_a_stop_goes_out_though_it_cannot_be_recorded(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bytes] = []
+    bench.serve(Leaf.STOP, lambda request: asked.append(request.payload))
+
+    def record(entry: Entry) -> Message | None:
+        raise _Unrecordable(entry.topic)
+
+    monkeypatch.setattr(bench.messenger, "_record", record)
+    with pytest.raises(_Unrecordable):
+        bench.run(bench.messenger.stop("A", "tester", "for a test"))
+    bench.run(asyncio.sleep(0.01))
+    assert [decode(Stop, payload).why for payload in asked] == ["for a test"]
+
+
+def test_what_cannot_be_recorded_does_not_leave_what_came_with_it_unread(wire: SimpleNamespace) -> None:
+    bench, posted = Bench(wire), list[Callable[[], None]]()
+
+    def record(entry: Entry) -> Message | None:
+        if entry.topic == key(wire.robot, "M3", Leaf.STATUS):
+            raise _Unrecordable(entry.topic)
+        return bench._record(entry)
+
+    endpoint = bench.network.endpoint("listener")
+    messenger = Messenger(endpoint, wire.robot, lambda: bench.loop.now_ns, posted.append, record)
+    messenger.start()
+    for number in range(20):
+        bench.module.publish(key(wire.robot, f"M{number}", Leaf.STATUS), encode(wire.status(f"M{number}")))
+    bench.run(asyncio.sleep(0.01))
+    with pytest.raises(_Unrecordable):
+        posted.pop(0)()
+    # No later message has to come for the rest to be read.
+    while posted:
+        posted.pop(0)()
+    assert sorted(bench.recording.modules) == sorted(f"M{number}" for number in range(20) if number != 3)
     bench.loop.close()
 
 

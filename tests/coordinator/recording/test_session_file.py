@@ -11,10 +11,16 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from coordinator.recording.recording import Entry
+from coordinator.recording.recording import MAX_MODULES, Entry
 from coordinator.recording.run_folder import load_recording
-from coordinator.recording.session_file import MCAP0_MAGIC, SessionFileError, SessionWriter, read_session
-from module_agent.wire.keys import Leaf
+from coordinator.recording.session_file import (
+    MCAP0_MAGIC,
+    SessionFileError,
+    SessionWriter,
+    read_session,
+)
+from module_agent.wire.keys import Leaf, key
+from module_agent.wire.messages import Stop
 
 PERIOD_NS = 20_000_000
 
@@ -236,6 +242,34 @@ def test_a_recording_ends_at_its_limit_and_is_whole_up_to_there(
     assert read[:-1] == entries[: len(read) - 1]
     assert 50 < len(read) < 2000
     assert read[-1].kind == "journal"
+
+
+def test_made_up_keys_leave_room_for_modules_and_for_every_stop(
+    tmp_path: Path, wire: SimpleNamespace
+) -> None:
+    """MCAP numbers channels in 16 bits; anybody may publish under more serials than that."""
+    path = tmp_path / "session.mcap"
+    writer = SessionWriter(path)
+    noise = wire.publication(Leaf.STATUS, wire.status())
+    made_up = [noise._replace(topic=key("robot", f"M{number}", Leaf.STATUS)) for number in range(2**16 + 8)]
+    taken = [entry for entry in made_up if writer.write(entry)]
+    assert taken == made_up[:MAX_MODULES]
+    assert writer.unrecorded == len(made_up) - MAX_MODULES
+    # What is asked and answered has its place, and then all that this module publishes, and what others do.
+    own = [
+        wire.request(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="tester")),
+        wire.reply(Leaf.STOP, wire.ack(re=1)),
+        wire.publication(Leaf.STATUS, wire.status("A")),
+        wire.publication(Leaf.FEEDBACK, wire.feedback("M0")),
+        wire.journal("failed", text="stopped"),
+    ]
+    assert all(map(writer.write, own))
+    assert writer.write(made_up[0])
+    writer.close()
+    assert writer.failure is None
+    damage: list[str] = []
+    assert list(read_session(path, damage.append)) == [*taken, *own, made_up[0]]
+    assert not damage
 
 
 def test_a_record_that_is_turned_into_the_end_of_the_data_is_reported(
