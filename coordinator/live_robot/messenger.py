@@ -22,7 +22,7 @@ from module_agent.transport.transport import (
 )
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, encode
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Message, Stop, cut
+from module_agent.wire.messages import Ack, LeaseRequest, Message, Stop, cut
 from module_agent.wire.proof import proven
 from module_agent.wire.refusal import WireError
 from module_agent.wire.topics import HEARD_BY_COORDINATOR
@@ -186,7 +186,7 @@ class Messenger:
             sent_ns = self._clock()
             # First: whatever becomes of the recording, a stop goes out. Its answer waits for the event loop.
             self._transport.query(topic, payload, timeout_s, self._sink, tag)
-            self._record(Entry("request", topic, sent_ns, payload))
+            self._record(Entry("request", topic, sent_ns, _recorded(message, payload)))
             reply, t_ns = await future
         finally:
             self._pending.pop(tag, None)
@@ -209,6 +209,9 @@ class Messenger:
         answer = await self.ask(serial, leaf, message, timeout_s, secret)
         if not isinstance(answer, Ack):
             raise NoAnswer(serial, leaf, f"its answer is {type(answer).__name__}, not Ack")
+        # A module that refuses a command may not have read its number.
+        if answer.re != message.seq and (answer.accepted or answer.re):
+            raise NoAnswer(serial, leaf, f"it answers command {answer.re}, asked was {message.seq}")
         if not answer.accepted:
             raise Refused(serial, leaf, answer)
         return answer
@@ -242,6 +245,13 @@ async def gather_all(work: Iterable[Coroutine[None, None, object]]) -> None:
     for outcome in await asyncio.gather(*work, return_exceptions=True):
         if isinstance(outcome, BaseException):
             raise outcome
+
+
+def _recorded(message: Message, payload: bytes) -> bytes:
+    """Return what is recorded of a request: who reads a recording is not to learn the secret of a lease."""
+    if isinstance(message, LeaseRequest) and message.secret:
+        return encode(message.model_copy(update={"secret": b""}))
+    return payload
 
 
 def _is_of_a_module(text: str) -> bool:

@@ -16,13 +16,14 @@ from coordinator.live_robot.messenger import NoAnswer
 from coordinator.monitoring.reference import build_reference, steps_of_run
 from coordinator.recording.recording import Entry
 from coordinator.recording.run_folder import load_recording
-from coordinator.recording.session_file import NotRecorded, SessionWriter
+from coordinator.recording.session_file import NotRecorded, SessionWriter, read_session
 from coordinator.session.session import NoModulesFound
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.wire.keys import Leaf, key
 from sim.physics.engine import Physics
 from sim.scoring.score import score
 from sim.virtual_time.loop import NS_PER_S
+from tests.rig import SECRET
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -329,6 +330,12 @@ def test_messages_on_made_up_keys_neither_end_a_session_nor_keep_its_stop_back(
     (said,) = [line for line in rig.notes if "not recorded" in line]
     # Two messages of each made-up module that has no place beside those of the robot.
     assert said.startswith(f"{2 * (50 - 10 + len(rig.serials))} messages ")
-    kept = load_recording(tmp_path / "run" / "session.mcap")
+    path = tmp_path / "run" / "session.mcap"
+    kept = load_recording(path)
     assert not kept.damage
     assert all(kept.modules[serial].rows.count > 1000 for serial in rig.serials)
+    # The leases were acquired with a secret, which no reader of the recording learns.
+    acquired = [each for each in read_session(path) if each.topic.endswith("/lease")]
+    assert len(acquired) > 10
+    assert not any(SECRET in each.payload for each in read_session(path))
+    assert SECRET not in path.read_bytes()

@@ -284,8 +284,9 @@ class Robot:
             return encode(self.wire.status(serial, re=asked.seq))
         if at.endswith("info"):
             return encode(self.wire.info(serial, family="Arm", name=f"{serial}-joint"))
-        self.stopped.append(decode(Stop, payload).serial)
-        return encode(self.wire.ack(serial=serial))
+        stop = decode(Stop, payload)
+        self.stopped.append(stop.serial)
+        return encode(self.wire.ack(serial=serial, re=stop.seq))
 
     def close(self) -> None:
         self.closed = True

@@ -13,7 +13,7 @@ from module_agent.transport.inbox import EVENT_BYTES
 from module_agent.transport.transport import Request, TransportError
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
-from module_agent.wire.messages import Ack, Message, Stop
+from module_agent.wire.messages import Ack, Identify, LeaseRequest, Message, Stop
 from module_agent.wire.refusal import WireError
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.network import VirtualEndpoint, VirtualNetwork
@@ -80,6 +80,29 @@ def test_requests_and_replies_are_recorded(bench: Bench) -> None:
     assert len(bench.recording.modules["A"].round_trips) == 1
 
 
+def test_the_secret_of_a_lease_is_sent_and_not_recorded(bench: Bench) -> None:
+    sent: list[bytes] = []
+
+    def grant(request: Request) -> bytes:
+        sent.append(request.payload)
+        return encode(bench.wire.ack(re=3))
+
+    bench.serve(Leaf.LEASE, grant)
+    secret = bytes(range(100, 116))
+    command = LeaseRequest(
+        serial="A", boot=1, seq=3, sender="tester", action="acquire", token=0, echo_ns=0, secret=secret
+    )
+    bench.run(bench.messenger.command("A", Leaf.LEASE, command, secret=secret))
+    assert decode(LeaseRequest, sent[0]) == command
+    request, reply = bench.entries
+    # What is recorded is read as ever, and its answer is a round trip.
+    assert decode(LeaseRequest, request.payload) == command.model_copy(update={"secret": b""})
+    assert not any(secret in entry.payload for entry in bench.entries)
+    assert reply.kind == "reply"
+    assert bench.recording.refused == {}
+    assert len(bench.recording.modules["A"].round_trips) == 1
+
+
 def test_replies_in_any_order_match_their_requests(bench: Bench) -> None:
     wire = bench.wire
 
@@ -134,6 +157,33 @@ def test_a_refusal_names_module_command_and_reason(bench: Bench) -> None:
 def test_an_accepted_command_returns_its_acknowledgement(bench: Bench) -> None:
     bench.serve(Leaf.STOP, lambda _: encode(bench.wire.ack(re=1)))
     assert bench.run(bench.stop()) == bench.wire.ack(re=1)
+
+
+@pytest.mark.parametrize(("number", "accepted"), [(7, True), (0, True), (7, False)])
+def test_an_acknowledgement_of_another_command_is_no_answer(
+    bench: Bench, number: int, accepted: bool
+) -> None:
+    """As of a command that was answered late; what is refused unread has no number."""
+    bench.serve(Leaf.IDENTIFY, lambda _: encode(bench.wire.ack(re=number, accepted=accepted)))
+    command = Identify(serial="A", boot=0, seq=1, sender="tester", on=True)
+    with pytest.raises(NoAnswer, match=f"it answers command {number}, asked was 1"):
+        bench.run(bench.messenger.command("A", Leaf.IDENTIFY, command))
+
+
+def test_a_stop_that_is_answered_by_the_acknowledgement_of_another_command_is_sent_again(
+    bench: Bench,
+) -> None:
+    asked: list[int] = []
+
+    def answer(request: Request) -> bytes:
+        asked.append(decode(Stop, request.payload).seq)
+        return encode(bench.wire.ack(re=1))
+
+    bench.messenger.next_seq()
+    bench.serve(Leaf.STOP, answer)
+    with pytest.raises(NoAnswer):
+        bench.run(bench.messenger.stop("A", "tester", "for a test"))
+    assert asked == [2, 3, 4]
 
 
 def test_liveliness_tokens_give_the_modules_present(bench: Bench) -> None:
