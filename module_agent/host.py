@@ -396,7 +396,7 @@ class AgentHost:
     def _publish_findings(self) -> None:
         while self._findings:
             module, finding = self._findings.pop(0)
-            module.observer.findings[finding.joint] = finding
+            module.observer.keep(finding)
             self._transport.publish(module.key(Leaf.ESTIMATE), encode(module.estimate(finding)))
 
     def _submit(self, module: HostedModule, motion: JointMotion) -> None:

@@ -12,12 +12,22 @@ from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, even,
 from module_agent.firmware.feedback import History
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import UNCALIBRATED, ImuPrior
-from module_agent.peers.motion_listener import JointMotion
+from module_agent.peers.motion_listener import MAX_MODULES, JointMotion
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import CircleEstimate, MotionRecord, RegressionEstimate, Vector3, cut
+from module_agent.wire.messages import (
+    MAX_ROWS_PER_MOTION,
+    CircleEstimate,
+    MotionRecord,
+    RegressionEstimate,
+    Vector3,
+    cut,
+)
 
 # Own samples to either side of a motion: more than the rough clock mapping may be wrong by.
 MARGIN_NS = 150_000_000
+# Of all constant motions that wait for their windowed sines: the two longest ones that can be, or 4 s at
+# 250 Hz of 200 joints, in 40 MB. A joint makes both after each other; others may be made up.
+MAX_CONSTANT_ROWS = 2 * MAX_ROWS_PER_MOTION
 
 
 class Finding(NamedTuple):
@@ -46,7 +56,8 @@ class _Constant(NamedTuple):
 class Observer:
     """Holds, per joint, the constant motion until the windowed sine follows, and the findings.
 
-    `knowledge` is the prior of the module's own IMU.
+    Of as many joints as a robot has modules; those that moved longest ago give way. `knowledge` is the prior
+    of the module's own IMU.
     """
 
     def __init__(self, serial: str, boot: int, knowledge: ImuPrior = UNCALIBRATED):
@@ -62,6 +73,20 @@ class Observer:
         own = _own_rows(history, motion, motion.rough_offset_ns.get(self.serial, 0))
         still = self._rest_rows(history, rest)
         return lambda: self._analyse(motion, imu_window(own), imu_window(still))
+
+    def keep(self, finding: Finding) -> None:
+        """Keep a finding as the latest of its joint."""
+        self.findings.pop(finding.joint, None)
+        self.findings[finding.joint] = finding
+        if len(self.findings) > MAX_MODULES:
+            del self.findings[next(iter(self.findings))]
+
+    def _keep_constant(self, joint: str, constant: _Constant) -> None:
+        self._constant.pop(joint, None)
+        self._constant[joint] = constant
+        rows = sum(len(each.windows.joint.t_ns) for each in self._constant.values())
+        while rows > MAX_CONSTANT_ROWS or len(self._constant) > MAX_MODULES:
+            rows -= len(self._constant.pop(next(iter(self._constant))).windows.joint.t_ns)
 
     def _rest_rows(self, history: History, rest: MotionRecord | None) -> Rows:
         """Return the rows of the last rest, kept longer than the history keeps them; none before any rest."""
@@ -87,7 +112,7 @@ class Observer:
             moved, ratio, *_ = detect_motion([aligned], still.gyro_offset_rad_s)
             found = found._replace(moved=moved, rate_ratio=ratio)
             if motion.record.pattern.kind == "constant":
-                self._constant[motion.serial] = _Constant(motion.boot, number, aligned, windows, moved)
+                self._keep_constant(motion.serial, _Constant(motion.boot, number, aligned, windows, moved))
                 return found
             # Slow motion decides: near a resonance of the held joints the windowed sine shakes modules that
             # the joint does not carry, and keeps others still that it does carry.

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from module_agent.estimate.observer import Observer
+from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.feedback import History
-from module_agent.peers.motion_listener import JointMotion
+from module_agent.peers.motion_listener import MAX_MODULES, JointMotion
 from module_agent.wire.feedback_rows import ROW, Rows
 from module_agent.wire.messages import ConstantMotion, MotionRecord, Pattern, Rest, WindowedSine
 
@@ -122,6 +122,35 @@ def test_the_constant_motion_of_an_earlier_boot_is_not_used(horizontal_link: Any
     scene.observe(observer, "constant")
     scene.motions["sine"] = scene.motions["sine"]._replace(boot=6)
     assert "no constant motion" in scene.observe(observer, "sine").note
+
+
+def test_joints_that_were_made_up_do_not_fill_the_memory_and_the_latest_one_is_measured(
+    horizontal_link: Any, observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene(horizontal_link)
+    rows = len(scene.motions["constant"].rows)
+    monkeypatch.setattr("module_agent.estimate.observer.MAX_CONSTANT_ROWS", 10 * rows + 1)
+    for number in range(30):
+        of_joint = scene.motions["constant"]._replace(serial=f"M{number}")
+        assert observer.job(of_joint, scene.history, scene.rest)().moved
+    kept = sum(len(each.windows.joint.t_ns) for each in observer._constant.values())
+    assert 9 * rows <= kept <= 10 * rows
+    scene.observe(observer, "constant")
+    assert scene.observe(observer, "sine").circle is not None
+
+
+def test_findings_of_as_many_joints_as_a_robot_has_are_kept(observer: Observer) -> None:
+    def finding(joint: str) -> Finding:
+        return Finding(joint, (1,), False, 0.0, (0.0, 0.0, 9.8), None, None, "")
+
+    for number in range(MAX_MODULES):
+        observer.keep(finding(f"M{number}"))
+    assert len(observer.findings) == MAX_MODULES >= 256
+    # A joint that has moved again is not the one that moved longest ago.
+    observer.keep(finding("M0"))
+    observer.keep(finding("late"))
+    assert "M1" not in observer.findings
+    assert {"M0", "M2", "late"} <= set(observer.findings)
 
 
 def test_without_rest_there_is_a_note_and_no_circle(horizontal_link: Any, observer: Observer) -> None:
