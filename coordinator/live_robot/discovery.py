@@ -1,17 +1,18 @@
 """Discovery of the modules of a robot, and the commands that need no lease: list and stop."""
 
 import asyncio
-import queue
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
-from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused
-from coordinator.recording.recording import Entry, Recording
+from coordinator.live_robot.messenger import INBOX_BYTES, LANE_BYTES, Clock, Messenger, NoAnswer, Refused
+from coordinator.recording.recording import MAX_MODULES, Entry, Recording
 from module_agent.model.errors import RobotError
+from module_agent.transport.inbox import Inbox
 from module_agent.transport.transport import Event, Liveness, Reply, Sample, Transport
-from module_agent.wire.codec import decode, encode
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Ask, Identify, Info, Message, Status
 from module_agent.wire.refusal import WireError
@@ -70,22 +71,46 @@ async def await_modules(
         await asyncio.sleep(poll_s)
 
 
+class _Arrivals:
+    """Events with the times of their arrival [ns], which one thread waits for; bounded as an `Inbox` is."""
+
+    def __init__(self) -> None:
+        self._inbox = Inbox(MAX_MESSAGE_BYTES, LANE_BYTES, INBOX_BYTES)
+        self._arrived = threading.Event()
+
+    def put(self, event: Event) -> None:
+        """Take an event in, from any thread."""
+        self._inbox.put(event, time.monotonic_ns())
+        self._arrived.set()
+
+    def get(self, timeout_s: float) -> tuple[int, Event] | None:
+        """Return the next event and its time; None if there is none within the time."""
+        # Before the look: what arrives after it sets it again.
+        self._arrived.clear()
+        taken = self._inbox.drain_stamped(limit=1)
+        if not taken and self._arrived.wait(timeout_s):
+            taken = self._inbox.drain_stamped(limit=1)
+        return taken[0] if taken else None
+
+
 def _present(transport: Transport, robot: str, search: Search) -> list[str]:
-    events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+    events = _Arrivals()
     declared = transport.watch_alive(every(robot, Leaf.ALIVE), events.put)
     alive: dict[str, bool] = {}
     start = changed = time.monotonic()
     while search.expect is None or sum(alive.values()) < search.expect:
         quiet_s = search.quiet_s if alive else search.first_s
         end = min(max(start + search.min_s, changed + quiet_s), start + MAX_S)
-        try:
-            event = events.get(timeout=max(0.0, end - time.monotonic()))
-        except queue.Empty:
+        arrived = events.get(max(0.0, end - time.monotonic()))
+        if arrived is None:
             break
+        _, event = arrived
         if isinstance(event, Liveness):
             with suppress(WireError):  # the token of something that is no module
-                alive[parse(event.key).serial] = event.alive
-                changed = time.monotonic()
+                serial = parse(event.key).serial
+                if serial in alive or len(alive) < MAX_MODULES:
+                    alive[serial] = event.alive
+                    changed = time.monotonic()
     declared.undeclare()
     return sorted(serial for serial, present in alive.items() if present)
 
@@ -94,15 +119,15 @@ def _ask_all(
     transport: Transport, robot: str, search: Search, leaf: Leaf, request: Request, expected: type[M]
 ) -> tuple[list[str], dict[str, M]]:
     """Return the serials present, and their answers as far as readable. Closes the transport."""
-    events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+    events = _Arrivals()
     answers: dict[str, M] = {}
     try:
         serials = _present(transport, robot, search)
         for tag, serial in enumerate(serials):
             transport.query(key(robot, serial, leaf), encode(request(serial)), ANSWER_S, events.put, tag)
         for _ in serials:
-            event = events.get(timeout=ANSWER_S + 5.0)
-            if isinstance(event, Reply) and event.payload is not None:
+            arrived = events.get(ANSWER_S + 5.0)
+            if arrived is not None and isinstance(event := arrived[1], Reply) and event.payload is not None:
                 with suppress(WireError):
                     answers[parse(event.key).serial] = decode(expected, event.payload)
     finally:
@@ -128,19 +153,16 @@ def listed(transport: Transport, robot: str, search: Search, listen_s: float = L
 
     Closes the transport.
     """
-    arrived: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
+    events = _Arrivals()
     recording, received = Recording(), 0
-
-    def sink(event: Event) -> None:
-        arrived.put((time.monotonic_ns(), event))
 
     def take_until(end_s: float, complete: Callable[[], bool] = lambda: False) -> None:
         nonlocal received
         while not complete() and (left_s := end_s - time.monotonic()) > 0.0:
-            with suppress(queue.Empty):
-                t_ns, event = arrived.get(timeout=left_s)
+            arrived = events.get(left_s)
+            if arrived is not None:
                 received += 1
-                _record(recording, open_tags, t_ns, event)
+                _record(recording, open_tags, *arrived)
 
     open_tags: set[int] = set()
 
@@ -148,12 +170,12 @@ def listed(transport: Transport, robot: str, search: Search, listen_s: float = L
         topic, payload = key(robot, serial, leaf), encode(_ask(serial, tag))
         open_tags.add(tag)
         recording.accept(Entry("request", topic, time.monotonic_ns(), payload))
-        transport.query(topic, payload, ANSWER_S, sink, tag)
+        transport.query(topic, payload, ANSWER_S, events.put, tag)
 
     try:
         serials = _present(transport, robot, search)
         begun_s, cpu_s = time.monotonic(), time.process_time()
-        transport.subscribe(every(robot, Leaf.FEEDBACK), sink)
+        transport.subscribe(every(robot, Leaf.FEEDBACK), events.put)
         for number in range(TRIPS):
             for place, serial in enumerate(serials):
                 ask(serial, Leaf.STATUS, number * len(serials) + place + 1)
@@ -203,10 +225,11 @@ def light_led(transport: Transport, robot: str, serial: str, sender: str, on: bo
     """
     if on and serial not in (there := _present(transport, robot, search)):
         raise RobotError(f"no module {serial} of robot {robot!r}; there are {', '.join(there) or 'none'}")
-    events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+    events = _Arrivals()
     request = encode(Identify(serial=serial, boot=0, seq=1, sender=sender, on=on))
     transport.query(key(robot, serial, Leaf.IDENTIFY), request, ANSWER_S, events.put, 0)
-    event = events.get(timeout=ANSWER_S + 5.0)
+    arrived = events.get(ANSWER_S + 5.0)
+    event = None if arrived is None else arrived[1]
     if not isinstance(event, Reply) or event.payload is None:
         raise RobotError(f"module {serial} does not confirm that its LED is {'lit' if on else 'off'}")
     ack = decode(Ack, event.payload)

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from typing import NamedTuple
 
-from coordinator.recording.recording import Entry
+from coordinator.recording.recording import MAX_MODULES, Entry
 from module_agent.model.errors import RobotError
 from module_agent.transport.inbox import Inbox
 from module_agent.transport.transport import (
@@ -65,9 +65,9 @@ class Refused(RobotError):
 class Messenger:
     """Publishes, sends requests and receives for the coordinator; every message passes through `record`.
 
-    `alive`: serials of the modules on the network. `post` runs a function on the event loop from any thread
-    (`call_soon_threadsafe` in real time). `cpu_clock` returns the processor time of the event loop's
-    thread [ns].
+    `alive`: serials of the modules on the network, of as many as a recording takes. `post` runs a function on
+    the event loop from any thread (`call_soon_threadsafe` in real time). `cpu_clock` returns the processor
+    time of the event loop's thread [ns].
     """
 
     def __init__(
@@ -156,7 +156,11 @@ class Messenger:
         elif isinstance(event, Sample):
             self._record(Entry("publication", event.key, t_ns, event.payload))
         elif isinstance(event, Liveness):
-            (self.alive.add if event.alive else self.alive.discard)(parse(event.key).serial)
+            serial = parse(event.key).serial
+            if not event.alive:
+                self.alive.discard(serial)
+            elif len(self.alive) < MAX_MODULES:
+                self.alive.add(serial)
         elif isinstance(event, Reply):
             self._answer(event, t_ns)
 

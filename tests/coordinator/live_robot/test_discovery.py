@@ -1,12 +1,17 @@
 """Waiting for modules: by the liveliness tokens on the network, on the session's clock."""
 
 import asyncio
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from coordinator.live_robot import discovery
+from coordinator.live_robot.messenger import LANE_BYTES
+from coordinator.recording.recording import MAX_MODULES
+from module_agent.transport.transport import Event, Liveness, Reply, Sample
+from module_agent.wire.keys import Leaf, key
 
 
 @pytest.fixture
@@ -41,6 +46,46 @@ def test_quiet_time_counts_from_the_last_module_that_came(network: Any) -> None:
 def test_when_the_time_is_up_it_returns_the_modules_present(network: Any) -> None:
     network.coming = {"A": 0.1}
     assert wait(network, lambda *_: False, timeout_s=2.0, poll_s=0.05) == ({"A"}, 2.0)
+
+
+class _Flooded:
+    """A network on which anybody may be, and publish, before and while modules are searched for."""
+
+    def __init__(self, tokens: int, messages: int):
+        self.tokens, self.messages = tokens, messages
+
+    def watch_alive(self, expression: str, sink: Callable[[Event], None]) -> Any:
+        robot = expression.split("/")[1]
+        for serial in ("A", *(f"M{number}" for number in range(self.tokens))):
+            sink(Liveness(key(robot, serial, Leaf.ALIVE), True))
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def subscribe(self, expression: str, sink: Callable[[Event], None]) -> None:
+        for _ in range(self.messages):
+            sink(Sample(key(expression.split("/")[1], "A", Leaf.FEEDBACK), bytes(20_000)))
+
+    def query(
+        self, at: str, payload: bytes, timeout_s: float, sink: Callable[[Event], None], tag: int
+    ) -> None:
+        sink(Reply(tag, at, None, "nobody"))
+
+    def close(self) -> None: ...
+
+
+SHORT = discovery.Search(quiet_s=0.01, first_s=0.01)
+
+
+def test_tokens_that_were_made_up_are_as_many_as_a_robot_may_have() -> None:
+    _, silent = discovery.described(_Flooded(MAX_MODULES + 500, 0), "robot", SHORT)  # type: ignore[arg-type]
+    assert len(silent) == MAX_MODULES
+    assert "A" in silent
+
+
+def test_what_arrives_while_modules_are_listed_is_kept_up_to_a_bound() -> None:
+    found = discovery.listed(_Flooded(0, 3000), "robot", SHORT, listen_s=0.5)  # type: ignore[arg-type]
+    assert found.silent == ["A"]
+    # 60 MB are sent; of one key no more waits than an inbox has room for.
+    assert found.recording.refused["malformed"] <= LANE_BYTES // 20_000
 
 
 def test_modules_that_are_present_already_need_no_wait(network: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coordinator.live_robot.messenger import LANE_BYTES, Messenger, NoAnswer, Refused
-from coordinator.recording.recording import Entry, Recording
+from coordinator.recording.recording import MAX_MODULES, Entry, Recording
 from module_agent.transport.inbox import EVENT_BYTES
 from module_agent.transport.transport import Request, TransportError
 from module_agent.wire.codec import decode, encode
@@ -199,6 +199,16 @@ def test_liveliness_tokens_give_the_modules_present(bench: Bench) -> None:
     bench.network.kill("module")
     bench.run(asyncio.sleep(0.01))
     assert bench.messenger.alive == set()
+
+
+def test_liveliness_tokens_that_were_made_up_are_as_many_as_a_robot_may_have(bench: Bench) -> None:
+    bench.messenger.start()
+    bench.module.declare_alive(key(bench.wire.robot, "A", Leaf.ALIVE))
+    for number in range(MAX_MODULES + 100):
+        bench.module.declare_alive(key(bench.wire.robot, f"M{number}", Leaf.ALIVE))
+    bench.run(asyncio.sleep(0.01))
+    assert len(bench.messenger.alive) == MAX_MODULES
+    assert "A" in bench.messenger.alive
 
 
 def test_a_large_burst_is_received_completely_and_in_order(bench: Bench) -> None:
