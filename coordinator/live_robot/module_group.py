@@ -137,8 +137,11 @@ class ModuleGroup:
         Raises:
             ModuleLost: its token or feedback is missing, it has booted again, its lease was taken, or it
                 follows set-points of another program that has the secret of the lease.
+            RecordingFull: its feedback cannot be kept any more.
             RobotStopped: a module that this sender holds was stopped.
         """
+        # First: rows that are not kept look like silence.
+        self._recording.check_room(self.serials)
         now = self._clock()
         for serial in self.serials:
             record = self.module(serial)

@@ -35,8 +35,16 @@ JOURNAL_TOPIC = "journal"
 MAX_OPEN_REQUESTS = 4096
 # Of one module in one session, and of modules: what is beyond is made up, and is not to fill the memory.
 MAX_BOOTS, MAX_MODULES = 32, 1024
+# Of all modules together, 6.8 GB: more than seven full logs of rows, or 17 min of 256 modules at 250 Hz.
+MAX_ROWS_OF_ALL = 1 << 26
+# Of a boot that has not answered a question, which may be made up: 16 s at 250 Hz, in 0.4 MB.
+STRANGER_ROWS = 4096
 # Of one joint by one module: motions that it was estimated from.
 MAX_ESTIMATES = 256
+
+
+class RecordingFull(RobotError):
+    """No more feedback of a session can be kept in memory; the message names a module and says what to do."""
 
 
 class Entry(NamedTuple):
@@ -104,8 +112,9 @@ class ModuleRecord:
     newest_ns: latest module time in any message. feedback_ns: session time at which feedback was published
     last, None before the first. newest_row_ns, newest_row_arrival_ns: module time of the newest published
     row, and session time at which it first arrived; messages that come late or twice do not change them.
-    arrivals: of all published messages whose rows had not come before. requested_rows: how many came in
-    answer to a request, and not by themselves before.
+    arrivals: of all published messages whose rows had not come before. has_answered: whether it has answered
+    a question; one that has not may be made up. requested_rows: how many came in answer to a request, and not
+    by themselves before.
     """
 
     def __init__(self, serial: str, boot: int):
@@ -122,6 +131,7 @@ class ModuleRecord:
         self.newest_row_ns = -1
         self.newest_row_arrival_ns = 0
         self.arrivals = Arrivals()
+        self.has_answered = False
         self.requested_rows = 0
 
     @property
@@ -181,12 +191,15 @@ class Recording:
         record = self.past.get((serial, boot))
         if record is None:
             self._make_room(serial)
+            latest = self.modules.get(serial)
+            if latest is not None and not latest.has_answered:
+                latest.forget(0, 0)
             # A late message of an earlier boot does not make that boot the latest again.
             record = self.past[serial, boot] = self.modules[serial] = ModuleRecord(serial, boot)
         return record
 
     def _make_room(self, serial: str) -> None:
-        """Forget the boot of a module with the fewest rows where there are too many.
+        """Forget a boot of a module where there are too many: made-up ones first, then those with few rows.
 
         Raises:
             WireError: LIMIT, there are too many modules.
@@ -195,7 +208,35 @@ class Recording:
             raise WireError(Refusal.LIMIT, f"{serial} is one module more than {MAX_MODULES}")
         boots = [record for (each, _), record in self.past.items() if each == serial]
         if len(boots) >= MAX_BOOTS:
-            del self.past[serial, min(boots, key=lambda record: record.rows.count).boot]
+            del self.past[serial, min(boots, key=lambda one: (one.has_answered, one.rows.count)).boot]
+
+    def _forget_stranger(self, module: ModuleRecord) -> None:
+        """Forget the older rows of a module that has not answered yet: anybody may publish as one."""
+        if not module.has_answered:
+            kept = STRANGER_ROWS if self.modules[module.serial] is module else 0
+            if module.rows.end_row - module.rows.first_row > 1.1 * kept:
+                module.forget(kept, kept)
+
+    def check_room(self, serials: Iterable[str]) -> None:
+        """Check that the next feedback of modules can be kept, for sessions that need all of it.
+
+        Raises:
+            RecordingFull: it cannot.
+        """
+        for serial in serials:
+            module = self.modules[serial]
+            if module.rows.is_full:
+                raise RecordingFull(
+                    f"no more feedback of module {serial} can be kept in memory: there are "
+                    f"{module.rows.count} rows of it{_lasted(module)}; {_WHAT_TO_DO}"
+                )
+        total = sum(module.rows.count for module in self.modules.values())
+        if total > MAX_ROWS_OF_ALL:
+            most = max(self.modules.values(), key=lambda module: module.rows.count)
+            raise RecordingFull(
+                f"no more feedback can be kept in memory: there are {total} rows of {len(self.modules)} "
+                f"modules, most of them of {most.serial}: {most.rows.count}{_lasted(most)}; {_WHAT_TO_DO}"
+            )
 
     def add(self, entry: Entry) -> Message | JournalEvent:
         """Add one entry; return its message.
@@ -220,7 +261,8 @@ class Recording:
         except WireError as error:
             if error.reason is Refusal.NOT_FINITE:
                 serial = parse(entry.topic).serial
-                self.not_finite[serial] = self.not_finite.get(serial, 0) + 1
+                if serial in self.modules or len(self.not_finite) < MAX_MODULES:
+                    self.not_finite[serial] = self.not_finite.get(serial, 0) + 1
             raise
 
     def _counted(self, read: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
@@ -292,6 +334,7 @@ class Recording:
         return message
 
     def _note(self, module: ModuleRecord, message: Message, entry: Entry) -> None:
+        module.has_answered |= entry.kind == "reply"
         match message:
             case Feedback():
                 is_new = not module.rows.has(message.first_row + message.count - 1)
@@ -308,6 +351,7 @@ class Recording:
                             module.arrivals.add(row_ns, entry.t_ns)
                         if row_ns > module.newest_row_ns:
                             module.newest_row_ns, module.newest_row_arrival_ns = row_ns, entry.t_ns
+                self._forget_stranger(module)
             case Status() | Ack():
                 module.newest_ns = max(module.newest_ns, message.t_ns)
                 if isinstance(message, Status):
@@ -414,6 +458,19 @@ class Recording:
         if info is None:
             raise DataError(f"module {serial} has not reported its type")
         return module_type(info.module_type)
+
+
+_WHAT_TO_DO = (
+    "what was recorded is kept; plan fewer or shorter motions, or give the agents a lower --feedback-rate"
+)
+
+
+def _lasted(module: ModuleRecord) -> str:
+    """Return how long the rows of a module last at the rate that it has told."""
+    if module.info is None:
+        return ""
+    rate_hz = module.info.feedback_rate_hz
+    return f", {module.rows.count / rate_hz / 60.0:.3g} min at {rate_hz:g} Hz"
 
 
 def _decode(exchange: Exchange, leaf: Leaf, payload: bytes) -> Message:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.wire.feedback_rows import ROW, Rows, unpack
-from module_agent.wire.messages import Feedback
+from module_agent.wire.messages import MAX_BATCH_ROWS, Feedback
 from module_agent.wire.refusal import Refusal, WireError
 
 # Four hours at 250 Hz, or one at 1 kHz: a row number farther off is not of this session.
@@ -114,6 +114,13 @@ class RowLog:
     def lost(self) -> int:
         """How many of the rows that were forgotten had never arrived."""
         return self._lost
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the next message may have no room, for the rows that came, and not for numbers made up."""
+        return (
+            self._end - self.first_row > MAX_ROWS - MAX_BATCH_ROWS and _MIN_FILLED * self._count >= MAX_ROWS
+        )
 
     def has(self, row: int) -> bool:
         """Return whether a row has arrived, or was forgotten."""

@@ -14,7 +14,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, UnfitLink
 from coordinator.live_robot.messenger import NoAnswer
 from coordinator.monitoring.reference import build_reference, steps_of_run
-from coordinator.recording.recording import Entry
+from coordinator.recording.recording import Entry, RecordingFull
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import NotRecorded, SessionWriter, read_session
 from coordinator.session.session import NoModulesFound
@@ -339,3 +339,15 @@ def test_messages_on_made_up_keys_neither_end_a_session_nor_keep_its_stop_back(
     assert len(acquired) > 10
     assert not any(SECRET in each.payload for each in read_session(path))
     assert SECRET not in path.read_bytes()
+
+
+def test_a_session_whose_rows_fill_the_memory_stops_the_robot_and_says_of_which_module(
+    rigs: Rigs, quick_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 12 s at 250 Hz; in full an hour at 1 kHz.
+    monkeypatch.setattr("module_agent.wire.row_log.MAX_ROWS", 3000)
+    rig = rigs(ARM, "lan", 1)
+    with pytest.raises(RecordingFull, match=rf"of module ({BASE}|{TIP}) .* rows of it, 0\.1.. min at 250 Hz"):
+        rig.session(tmp_path / "run", quick_plan)
+    assert {rig.state(serial) for serial in rig.serials} == {"stopped"}
+    assert load_recording(tmp_path / "run" / "session.mcap").journal[-1].what == "failed"

@@ -12,9 +12,11 @@ from coordinator.recording.recording import (
     JOURNAL_TOPIC,
     MAX_BOOTS,
     MAX_MODULES,
+    STRANGER_ROWS,
     Arrivals,
     Entry,
     Recording,
+    RecordingFull,
     RoundTrip,
 )
 from module_agent.wire.codec import encode
@@ -39,6 +41,7 @@ def test_rows_out_of_order_and_repeated_are_stored_once_in_order(
 
 
 def test_rows_of_two_boots_of_one_module_are_separate(recording: Recording, wire: SimpleNamespace) -> None:
+    recording.add(wire.reply(Leaf.STATUS, wire.status(boot=7)))
     recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=1000)))
     recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=8, first=0)))
     assert recording.modules["A"].boot == 8
@@ -265,15 +268,18 @@ def test_a_status_is_decoded_as_it_was_sent(recording: Recording, wire: SimpleNa
     assert recording.modules["A"].status == sent
 
 
-def test_boots_that_were_made_up_are_forgotten_before_those_with_rows(
+def test_boots_that_were_made_up_are_forgotten_before_those_that_have_answered(
     recording: Recording, wire: SimpleNamespace
 ) -> None:
+    for boot in (6, 7):
+        recording.add(wire.reply(Leaf.STATUS, wire.status(boot=boot)))
     for first in range(0, 100, 5):
         recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=first)))
     for boot in range(1000, 3000):
         recording.add(wire.publication(Leaf.STATUS, wire.status(boot=boot)))
     assert len(recording.past) == MAX_BOOTS
     assert recording.past["A", 7].rows.count == 100
+    assert ("A", 6) in recording.past
 
 
 def test_modules_that_were_made_up_do_not_fill_the_memory(
@@ -286,6 +292,68 @@ def test_modules_that_were_made_up_do_not_fill_the_memory(
     # The modules that were there before go on being recorded.
     assert recording.accept(wire.publication(Leaf.STATUS, wire.status("M5", t_ns=9))) is not None
     assert recording.modules["M5"].newest_ns == 9
+
+
+def test_of_a_module_that_answers_no_question_only_the_newest_rows_are_kept(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
+    for first in range(0, 10_000, 500):
+        # B publishes alike, and was asked before.
+        recording.add(wire.reply(Leaf.STATUS, wire.status("B")))
+        for serial in ("A", "B"):
+            recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(serial, first=first, count=500)))
+    made_up, asked = recording.modules["A"], recording.modules["B"]
+    assert STRANGER_ROWS <= made_up.rows.count <= 1.1 * STRANGER_ROWS
+    assert made_up.rows.end_row == 10_000
+    assert asked.rows.count == 10_000
+    # Another boot in its name leaves nothing of it, and nothing of what comes late.
+    recording.add(wire.publication(Leaf.STATUS, wire.status(boot=2)))
+    assert made_up.rows.count == 0
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=10_000)))
+    assert made_up.rows.count == 0
+    recording.add(wire.publication(Leaf.STATUS, wire.status("B", boot=2)))
+    assert asked.rows.count == 10_000
+
+
+def test_values_that_are_no_numbers_are_counted_of_the_modules_that_are_there(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
+    def send(serial: str) -> None:
+        bad = wire.estimate("A", serial).model_copy(update={"rate_ratio": np.nan})
+        recording.accept(wire.publication(Leaf.ESTIMATE, bad))
+
+    recording.add(wire.publication(Leaf.STATUS, wire.status("A")))
+    for number in range(MAX_MODULES + 100):
+        send(f"M{number}")
+    send("A")
+    assert len(recording.not_finite) == MAX_MODULES + 1
+    assert recording.not_finite["A"] == 1
+    assert recording.refused == {"not_finite": MAX_MODULES + 101}
+
+
+def test_a_session_whose_rows_fill_the_memory_is_told_of_which_module_how_many_and_what_to_do(
+    recording: Recording, wire: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 1 kHz four million rows are an hour."""
+    monkeypatch.setattr("module_agent.wire.row_log.MAX_ROWS", 3000)
+    for serial in ("A", "B"):
+        recording.add(wire.reply(Leaf.INFO, wire.info(serial)))
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback("A", first=0)))
+    # Numbers that were made up fill nothing.
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback("A", first=2990)))
+    recording.check_room(("A", "B"))
+    for first in range(0, 2900, 100):
+        recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback("B", first=first, count=100)))
+        if first == 2000:
+            recording.check_room(("A", "B"))
+    with pytest.raises(RecordingFull, match=r"module B .* 2900 rows of it, 0\.193 min at 250 Hz; .*rate"):
+        recording.check_room(("A", "B"))
+    monkeypatch.setattr("module_agent.wire.row_log.MAX_ROWS", 10_000)
+    recording.check_room(("A", "B"))
+    # Each has room, and all together have none.
+    monkeypatch.setattr("coordinator.recording.recording.MAX_ROWS_OF_ALL", 2900)
+    with pytest.raises(RecordingFull, match=r"2910 rows of 2 modules, most of them of B: 2900, .*rate"):
+        recording.check_room(("A", "B"))
 
 
 def test_a_recording_is_copied_while_another_thread_adds_to_it(wire: SimpleNamespace) -> None:
