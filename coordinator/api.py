@@ -12,6 +12,7 @@ differences, and its covariance is J C J^T.
 
 import asyncio
 import time
+import warnings
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from functools import cached_property
@@ -29,7 +30,7 @@ from coordinator.export.exported_run import ExportedRun, exported
 from coordinator.export.frames import instants_frame, samples_frame
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
-from coordinator.live_robot.connection import Place, new_sender, open_connection
+from coordinator.live_robot.connection import Place, exposures, new_sender, open_connection
 from coordinator.live_robot.discovery import await_modules
 from coordinator.live_robot.messenger import Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
@@ -44,6 +45,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import LostError
 from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
+from module_agent.transport.credentials import COORDINATOR, OBSERVER, load_credentials
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import Feedback, GoTo, Message
@@ -349,6 +351,7 @@ async def connect(
     expect: int | None = None,
     timeout_s: float = 15.0,
     retained_rows: int = _RETAINED_ROWS,
+    secure: Path | str | None = None,
 ) -> AsyncIterator[LiveRobot]:
     """Connect to a robot on the network: `async with connect("my_arm", expect=4) as arm: ...`.
 
@@ -360,14 +363,22 @@ async def connect(
         timeout_s: how long to wait for them.
         retained_rows: how many of each module's newest feedback rows are kept, at 101 bytes each; by default
             those of ten minutes.
+        secure: the folder of keys that `x5-coordinator keys` makes, for a robot whose programs have
+            `--secure`; without it an endpoint that other machines reach is warned of, as a `UserWarning`.
 
     Raises:
-        UsageError: the network cannot be joined.
+        UsageError: the network cannot be joined, or the folder has no keys of a coordinator or an observer
+            of this robot.
         LostError: no module, or fewer than expected, answered within the time, or one sends no feedback.
     """
     loop = asyncio.get_running_loop()
     recording = Recording()
-    transport = open_connection(Place(robot, listen, tuple(routers)), lambda text: None).transport
+    known = load_credentials(Path(secure), robot, [COORDINATOR, OBSERVER]) if secure is not None else None
+    place = Place(robot, listen, tuple(routers), credentials=known)
+    for sentence in exposures(place):
+        warnings.warn(sentence, stacklevel=2)
+    # That a hub is there already is as it should be.
+    transport = open_connection(place, lambda text: None).transport
     messenger = Messenger(
         transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, _recorder(recording, retained_rows)
     )

@@ -40,6 +40,17 @@ class Connection(NamedTuple):
     is_hub: bool
 
 
+def exposures(place: Place) -> list[str]:
+    """Return a sentence on every endpoint of a robot by which other machines reach it."""
+    endpoints = place.connect or (place.listen,)
+    is_secured = place.credentials is not None
+    return [
+        f"{endpoint} is open to the network: {OPEN_TO_ALL}"
+        for endpoint in endpoints
+        if not is_secured and not is_loopback(endpoint)
+    ]
+
+
 def open_connection(place: Place, note: Callable[[str], None]) -> Connection:
     """Join a robot's network: at its routers, as its hub, or as a client of the hub that it has already.
 
@@ -50,9 +61,8 @@ def open_connection(place: Place, note: Callable[[str], None]) -> Connection:
     """
     is_hub = False
     known = place.credentials
-    for endpoint in place.connect or (place.listen,):
-        if known is None and not is_loopback(endpoint):
-            note(f"{endpoint} is open to the network: {OPEN_TO_ALL}")
+    for sentence in exposures(place):
+        note(sentence)
     try:
         if place.connect:
             opened = open_zenoh(_client(place.connect, known))

@@ -11,7 +11,9 @@ OPEN_TO_ALL = (
     "use --secure, see docs/security.md"
 )
 _WITH_PORT = ("tcp", "tls", "quic", "udp", "ws")
-_OTHERS = ("serial", "unixpipe", "unixsock-stream", "vsock")
+# Of this machine only; a serial line has another end, and a vsock reaches virtual machines.
+_LOCAL = ("unixpipe", "unixsock-stream")
+_OTHERS = (*_LOCAL, "serial", "vsock")
 _FORM = re.compile(r"(?P<protocol>[a-z-]+)/(?P<address>[^?#]+)([?#].*)?\Z")
 
 
@@ -44,7 +46,7 @@ def is_loopback(endpoint: str) -> bool:
     """Return whether an endpoint that `check_endpoint` takes is reached from this machine only."""
     match = _FORM.match(endpoint)
     if match is None or match["protocol"] in _OTHERS:
-        return match is not None
+        return match is not None and match["protocol"] in _LOCAL
     host = match["address"].rpartition(":")[0].strip("[]")
     if host == "localhost":
         return True
