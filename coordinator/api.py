@@ -34,6 +34,7 @@ from coordinator.live_robot.connection import Place, exposures, new_sender, open
 from coordinator.live_robot.discovery import await_modules
 from coordinator.live_robot.messenger import Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.merge.run_arrays import read_held_out_arrays
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, SESSION
 from coordinator.recording.run_folder import load_recording as read_recording
@@ -142,14 +143,17 @@ class SavedRun:
 
     @cached_property
     def held_out(self) -> HeldOutTorques | None:
-        """Torques of the held-out motions, measured and predicted; None for a run without dynamics."""
+        """Torques of the held-out motions, measured and predicted; None for a run without dynamics.
+
+        Raises:
+            RunArraysError: the file is damaged.
+        """
         path = self.folder / HELD_OUT
         if not path.is_file():
             return None
-        with np.load(path) as data:
-            t_s = _NS * (data["session_ns"] - self._exported.start_ns).astype(float)
-            arrays = (data["q_rad"], data["tau_measured_nm"], data["tau_predicted_nm"])
-            return HeldOutTorques(tuple(map(str, data["serials"])), t_s, *arrays)
+        serials, session_ns, *arrays = read_held_out_arrays(path)
+        t_s = _NS * (session_ns - self._exported.start_ns).astype(float)
+        return HeldOutTorques(serials, t_s, *arrays)
 
 
 def load_run(folder: Path | str) -> SavedRun:

@@ -1,6 +1,7 @@
 """Every file and option of the three programs, given something else: a sentence, a code, nothing made."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from module_agent.network_emulation.profile_file import load_network
 from module_agent.transport.credentials import load_fleet
 from sim.main import app as sim
 from sim.robot.robot_file import load_robot
+from sim.virtual_time.run import QUICK_PLAN, VirtualConfig, run_virtual
 from sim.world.external_force import parse_push
 
 PROGRAMS = {"x5-coordinator": coordinator, "x5-sim": sim, "x5-agent": agent}
@@ -224,6 +226,103 @@ def test_nonsense_is_refused(
     refused: Callable[[str, str, Path], str], tmp_path: Path, program: str, command: str
 ) -> None:
     refused(program, command, tmp_path / "missing")
+
+
+# --------------------------------------------------------------------------- runs with one damaged file
+
+# What reads a file of a run, whose folder is RUN, by that file.
+READ_BY: dict[str, tuple[str, ...]] = {
+    "session.mcap": (
+        "replay RUN --out NEW",
+        "report RUN --out NEW.md",
+        "export RUN --to csv --out NEW",
+        "check RUN --out NEW",
+        "check RUN --measured RUN",
+        "payload RUN --out NEW",
+        "monitor RUN",
+        "attend RUN",
+        "run --out NEW --baseline RUN",
+    ),
+    "session.rrd": ("view RUN", "screenshot RUN --out NEW.png"),
+    "result.json": (
+        "report RUN --out NEW.md",
+        "payload RUN --out NEW",
+        "attend RUN",
+        "compensate RUN",
+        "follow RUN --motion RUN/motion.csv --out NEW",
+    ),
+    "robot.urdf": (
+        "export RUN --to csv --out NEW",
+        "export RUN --to ros2 --out NEW",
+        "excite --urdf RUN/robot.urdf --out NEW",
+        "fit-dynamics --urdf RUN/robot.urdf --data RUN/motion.csv",
+    ),
+    "held_out.npz": ("report RUN --out NEW.md",),
+    "information.npz": ("merge RUN RUN --out NEW",),
+    "imu_calibration.npz": (
+        "merge RUN RUN --out NEW",
+        "run --out NEW --measured RUN",
+    ),
+}
+READ_BY_SIM = {
+    "result.json": ("score RUN",),
+    "held_out.npz": ("score RUN",),
+    "truth.json": ("score RUN",),
+    "truth.npz": ("score RUN",),
+    "robot.hrdf": ("run RUN/robot.hrdf --virtual --out NEW",),
+}
+OF_RUNS = [
+    (program, name, command)
+    for program, table in (("x5-coordinator", READ_BY), ("x5-sim", READ_BY_SIM))
+    for name, commands in table.items()
+    for command in commands
+]
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "cut": lambda content: content[: len(content) // 4],
+    "binary": lambda content: bytes(range(256)) * 20,
+    "empty": lambda content: b"",
+    "list": lambda content: b"[1, 2, 3]",
+    # The archive is whole, and what is packed in it is not.
+    "bytes": lambda content: content[:300] + bytes(40) + content[340:],
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run on an arm of two modules, dynamics included."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    plan = QUICK_PLAN.model_copy(update={"dynamics": True, "dynamic_repeats": 1})
+    run_virtual(VirtualConfig(load_robot(ROBOT), out, seed=3, plan=plan))
+    (out / "motion.csv").write_text("t_s,q_X-00009_rad\n0,0\n1,0\n")
+    return out
+
+
+@pytest.mark.xdist_group("damaged runs")
+@pytest.mark.parametrize(("program", "name", "command"), OF_RUNS)
+def test_a_run_with_one_damaged_file_is_refused_or_the_damage_is_said(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, name: str, command: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    failures = []
+    for kind, damaged in DAMAGE.items():
+        # Of a view that is cut the viewer shows what there is.
+        if (kind, name) == ("cut", "session.rrd") or (kind == "bytes" and not name.endswith("npz")):
+            continue
+        run, new = tmp_path / kind / "run", tmp_path / kind / "new"
+        shutil.copytree(finished, run, copy_function=os.link)
+        content = (run / name).read_bytes()
+        (run / name).unlink()
+        (run / name).write_bytes(damaged(content))
+        words = command.replace("RUN", str(run)).replace("NEW", str(new)).split(" ")
+        done = CliRunner().invoke(PROGRAMS[program], words)
+        said = done.stderr + done.stdout
+        private = [word for word in ("Traceback", "pydantic", "NoneType") if word in said]
+        is_ours = done.exception is None or isinstance(done.exception, SystemExit)
+        # What is left of a recording may be whole, and end early.
+        is_said = name in said or (name == "session.mcap" and "recording ends" in said)
+        if not is_ours or private or not is_said or done.exit_code not in (0, 1, 2, 3, 5):
+            failures.append(f"{kind}: {done.exit_code} {done.exception!r} {said}")
+    assert not failures, "\n".join(failures)
 
 
 # TOML that the parser of Python cannot read, or that no setting can be: what is said of it.

@@ -8,7 +8,7 @@ import typer
 from coordinator.recording.run_folder import REPORT
 from coordinator.report.pages import SUFFIXES, check_suffix, write_page
 from coordinator.report.plots import check_plots
-from coordinator.report.run_report import read_run, run_report
+from coordinator.report.run_report import gone, read_run, run_report
 from coordinator.runtime.command_line import in_a_folder
 from coordinator.runtime.terminal import Terminal
 
@@ -30,6 +30,8 @@ def report(
     with Terminal() as terminal:
         terminal.step(1, 2, f"reading {folder}")
         data = read_run(folder)
+        for sentence in gone(data):
+            terminal.note(sentence)
         terminal.step(2, 2, "drawing the report")
         write_page(path, run_report(data))
     typer.echo(f"written to {path}")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.description.urdf_reader import UrdfError, read_joints
 from coordinator.recording.recording import ModuleRecord, Recording
 from coordinator.recording.run_folder import ASIDE, RESULT, SESSION, URDF, load_recording
 from coordinator.recording.versions import current_run
@@ -51,6 +52,7 @@ def read_exported(folder: Path) -> ExportedRun:
         VersionError: see `current_run`.
         UsageError: the folder holds no recording of a run.
         SessionFileError: the recording cannot be read.
+        UsageError: the robot description is damaged.
         DataError: it has no samples of any module.
     """
     folder = current_run(folder)
@@ -63,7 +65,22 @@ def read_exported(folder: Path) -> ExportedRun:
         missing.append(f"the run has no {RESULT}: it did not end, or failed")
     if not urdf.is_file():
         missing.append(f"the run has no {URDF}: no robot description and no transforms")
-    return exported(load_recording(session), urdf.read_text() if urdf.is_file() else None, missing)
+    return exported(load_recording(session), _description(urdf) if urdf.is_file() else None, missing)
+
+
+def _description(path: Path) -> str:
+    """Return the text of a run's URDF.
+
+    Raises:
+        UsageError: it is damaged.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        read_joints(text)
+    except (UnicodeDecodeError, UrdfError) as error:
+        why = f"{path} is damaged: {error}"
+        raise UsageError(f"{why}; `x5-coordinator replay {path.parent}` writes it anew") from error
+    return text
 
 
 def exported(recording: Recording, urdf: str | None, missing: list[str]) -> ExportedRun:
@@ -72,10 +89,7 @@ def exported(recording: Recording, urdf: str | None, missing: list[str]) -> Expo
     Raises:
         DataError: it has no samples of any module.
     """
-    missing = [*recording.damage, *missing]
-    if recording.refused:
-        kinds = ", ".join(f"{count} {reason}" for reason, count in sorted(recording.refused.items()))
-        missing.append(f"messages that could not be read: {kinds}")
+    missing = [*recording.damage, *recording.remarks, *missing]
     known = {}
     for serial, module in sorted(recording.modules.items()):
         if not module.rows.end_row > module.rows.first_row:

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from coordinator.identification.result import DynamicsPart, Result
+from coordinator.merge.run_arrays import read_held_out_arrays
 from coordinator.recording.journal import JournalEvent, excluded_modules, exclusion_notes
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import HELD_OUT, REPORT, RESULT, SESSION, load_recording
@@ -98,13 +99,16 @@ def result_markdown(result: Result) -> str:
 
 
 def read_held_out(path: Path) -> HeldOutTorques | None:
-    """Read the torques of held-out motions; None if the run has none."""
+    """Read the torques of held-out motions; None if the run has none.
+
+    Raises:
+        RunArraysError: the file is not what it should be.
+    """
     if not path.is_file():
         return None
-    with np.load(path) as data:
-        t_s = _NS * (data["session_ns"] - data["session_ns"][0]).astype(float)
-        serials = tuple(map(str, data["serials"]))
-        return HeldOutTorques(serials, t_s, data["tau_measured_nm"], data["tau_predicted_nm"])
+    arrays = read_held_out_arrays(path)
+    t_s = _NS * (arrays.session_ns - arrays.session_ns[0]).astype(float)
+    return HeldOutTorques(arrays.serials, t_s, arrays.measured_nm, arrays.predicted_nm)
 
 
 def run_report(run: RunData) -> Document:
@@ -148,7 +152,8 @@ def _summary(run: RunData) -> Section:
         why = failed[-1] if failed else "the recording ends without a word on why"
         blocks = [Paragraph(text=f"The run ended early: {why}."), _modules(run)]
         return Section(title="Summary", blocks=tuple(blocks))
-    items = [f"The result is not to be believed as usual: {why}." for why in result.suspicions]
+    items = [f"{sentence}." for sentence in gone(run)]
+    items += [f"The result is not to be believed as usual: {why}." for why in result.suspicions]
     items.append(sure_topology(result))
     sigmas = [link.link_length_sigma_mm for link in result.links]
     spread = [HALF_95 * sigma for sigma in sigmas if sigma is not None]
@@ -182,6 +187,18 @@ def _summary(run: RunData) -> Section:
     )
     blocks = [Bullets(items=tuple(items)), drawing, _modules(run)]
     return Section(title="Summary", blocks=tuple(blocks))
+
+
+def gone(run: RunData) -> list[str]:
+    """Return what is gone of the recording since its result was computed, as sentences."""
+    recording, result = run.recording, run.result
+    if result is None or result.trace_hash == recording.trace_hash:
+        return []
+    why = "; ".join([*recording.damage, *recording.remarks])
+    return [
+        f"{SESSION} is not what {RESULT} was computed from{': ' if why else ''}{why}. Network, clocks and "
+        "events are of what there is; `x5-coordinator replay` computes the result anew"
+    ]
 
 
 def _from_to(least: float, most: float) -> str:

@@ -6,6 +6,7 @@ the result lists as unidentifiable, and along no others.
 
 import json
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -272,7 +273,7 @@ def _reading(path: Path) -> Iterator[Path]:
         raise ScoreError(f"{path} is not JSON: {error}") from error
     except KeyError as error:
         raise ScoreError(f"{path} lacks {error}") from error
-    except (ValueError, TypeError, OSError, zipfile.BadZipFile, DataError) as error:
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error, DataError) as error:
         raise ScoreError(f"{path} is broken: {error}") from error
 
 

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from coordinator.merge.information_file import (
     write_information,
 )
 from coordinator.merge.merge_runs import MergedInformation, MergeError, merge_runs
-from coordinator.merge.run_arrays import RunArraysError
+from coordinator.merge.run_arrays import RunArraysError, read_held_out_arrays
 from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from coordinator.parameter_fit.systematic_errors import chain_effects, error_directions
@@ -385,3 +386,36 @@ def test_the_command_says_what_it_needs(tmp_path: Path) -> None:
     empty = CliRunner().invoke(app, ["merge", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "x")])
     assert empty.exit_code == 2
     assert not (tmp_path / "x").exists()
+
+
+def test_whatever_is_damaged_in_a_file_it_is_refused_by_name(tmp_path: Path) -> None:
+    path, rng = tmp_path / "held_out.npz", default_rng(1)
+    names = ("q_rad", "tau_measured_nm", "tau_predicted_nm")
+    arrays = dict(zip(names, rng.normal(size=(3, 40, 2)), strict=True))
+    np.savez_compressed(path, serials=np.array(["A", "B"]), session_ns=np.arange(40), **arrays)
+    whole = path.read_bytes()
+    assert np.array_equal(read_held_out_arrays(path).measured_nm, arrays["tau_measured_nm"])
+    refused: list[str] = []
+    for _ in range(1000):
+        content = bytearray(whole)
+        # As often in the head of the archive and in its directory, which are a small part of it.
+        for at in rng.choice([rng.integers(len(whole)), rng.integers(300), -1 - rng.integers(400)], 2):
+            content[at] = rng.integers(256)
+        path.write_bytes(content)
+        try:
+            read_held_out_arrays(path)
+        except RunArraysError as error:
+            refused.append(str(error))
+    assert len(refused) > 700
+    assert all(str(path) in text and "replaying one" in text for text in refused)
+    # The heads of arrays: one that does not end, and one of more than any memory.
+    for head in (b"{'descr': (", b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000000,)}"):
+        with ZipFile(path, "w") as archive:
+            archive.writestr("serials.npy", b"\x93NUMPY\x01\0" + len(head).to_bytes(2, "little") + head)
+        with pytest.raises(RunArraysError, match="is not the torques of held-out motions"):
+            read_held_out_arrays(path)
+    # A file of numpy, but no archive of several arrays.
+    with path.open("wb") as file:
+        np.save(file, arrays["q_rad"])
+    with pytest.raises(RunArraysError, match="it is no npz file"):
+        read_held_out_arrays(path)

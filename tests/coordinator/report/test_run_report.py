@@ -24,7 +24,7 @@ from coordinator.report.document import Document, Table, figures, tables
 from coordinator.report.pages import html_page
 from coordinator.report.plots import robot_plot, without_pauses
 from coordinator.report.result_sections import HALF_95
-from coordinator.report.run_report import MAX_BARS, read_run, run_report, step_bars
+from coordinator.report.run_report import MAX_BARS, gone, read_run, run_report, step_bars
 from module_agent.model.chain import Chain
 from module_agent.model.errors import EXIT_SUSPECT, UsageError
 from sim.robot.robot_file import load_robot
@@ -220,6 +220,16 @@ def test_a_result_that_cannot_be_read_is_answered_with_the_place(folder: Path, t
     done = CliRunner().invoke(app, ["report", str(tmp_path)])
     assert done.exit_code == 2
     assert "result.json is no result of a run: robot" in done.output
+
+
+def test_of_a_recording_that_is_whole_nothing_is_gone(folder: Path, tmp_path: Path) -> None:
+    assert gone(read_run(folder)) == []
+    cut_short = cut(folder, tmp_path / "cut", lambda e: e.what == "explored", "lost")
+    (cut_short / RESULT).write_bytes((folder / RESULT).read_bytes())
+    (sentence,) = gone(read_run(cut_short))
+    assert sentence.startswith("session.mcap is not what result.json was computed from: the recording ends")
+    assert "x5-coordinator replay" in sentence
+    assert "the recording ends" in html_page(run_report(read_run(cut_short)))
 
 
 # --------------------------------------------------------------------------- runs that ended early
