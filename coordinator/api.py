@@ -326,7 +326,7 @@ class LiveRobot:
         Raises:
             Refused: another program holds one; the message names it and the time left. The others are held.
         """
-        await self.group.acquire(*(serials or ()))
+        await self.group.acquire(*(self.serials if serials is None else serials))
 
     async def move_to(self, position_rad: Mapping[str, float], max_speed_rad_s: float = 0.5) -> None:
         """Move joints of held modules to positions, all at the same time, by minimum jerk.

@@ -59,6 +59,8 @@ class Commander:
         self._clock = clock
         self._check = check
         self._tokens: dict[str, int] = {}
+        # In order: of many modules some answer in turn.
+        self._renewed: dict[str, None] = {}
         self._armed_ns: dict[str, int] = {}
         self._taken_by: dict[str, str] = {}
         self._repeated: dict[str, tuple[Leaf, Make]] = {}
@@ -134,7 +136,7 @@ class Commander:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """The modules whose leases are renewed."""
+        """The modules whose leases this sender has."""
         return tuple(self._tokens)
 
     @property
@@ -173,6 +175,7 @@ class Commander:
             raise
         self._taken_by.pop(serial, None)
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
+        self._renewed[serial] = None
         # Its lifetime counts from the echo in the request: on a slow network little of it is left.
         self._send(self._renew(serial))
         # With the first lease: it must not expire while the next module is slow to answer.
@@ -182,6 +185,7 @@ class Commander:
     def forget(self, serial: str) -> None:
         """Renew the lease of a module no more, which lapses then."""
         self._tokens.pop(serial, None)
+        self._renewed.pop(serial, None)
 
     def repeat(self, serial: str, leaf: Leaf, make: Make) -> None:
         """Send a command, which a module executes once, again and again while the network is poor.
@@ -208,9 +212,9 @@ class Commander:
     def renew(self, by_commands: bool = False) -> None:
         """Renew all leases once; `by_commands`: where one is to be repeated, by that."""
         ask = self._repeat_or_renew if by_commands else self._renew
-        held = list(self._tokens)
-        begin = self._turn % len(held) if len(held) > ANSWERED else 0
-        in_turn = held[begin:] + held[:begin]
+        renewed = list(self._renewed)
+        begin = self._turn % len(renewed) if len(renewed) > ANSWERED else 0
+        in_turn = renewed[begin:] + renewed[:begin]
         for serial in in_turn[:ANSWERED]:
             self._send(ask(serial))
         for serial in in_turn[ANSWERED:]:
@@ -252,7 +256,10 @@ class Commander:
         try:
             await gather_all(self._release(serial) for serial in self.held)
         finally:
-            await self._stop_keeping()
+            self._renewed.clear()
+            error = await self._stop_keeping()
+        if error is not None:
+            raise error
 
     async def _release(self, serial: str) -> None:
         try:
@@ -261,22 +268,27 @@ class Commander:
             # The first answer may have been lost: then there is nothing left to release.
             if refused.ack.reason not in (Refusal.NO_LEASE.value, Refusal.HELD.value):
                 raise
-        self._tokens.pop(serial, None)
+        self.forget(serial)
 
     async def stop_all(self, why: str) -> list[str]:
         """Stop every module that this sender holds; return the serials that did not confirm."""
         # Not the modules whose lease another coordinator has taken.
         held = [serial for serial in self._tokens if serial not in self._taken_by]
         self._tokens.clear()
+        self._renewed.clear()
         stops = (self._messenger.stop(serial, self.sender, why) for serial in held)
-        done = await asyncio.gather(*stops, return_exceptions=True)
-        await self._stop_keeping()
+        try:
+            done = await asyncio.gather(*stops, return_exceptions=True)
+        finally:
+            # Its error, if any, is what ends the session.
+            await self._stop_keeping()
         return [s for s, r in zip(held, done, strict=True) if isinstance(r, BaseException)]
 
-    async def _stop_keeping(self) -> None:
+    async def _stop_keeping(self) -> Exception | None:
+        """End the keep-alives; return the error that they had ended with."""
         keeper, self._keeper = self._keeper, None
-        if keeper is not None:
-            keeper.cancel()
-            (ended,) = await asyncio.gather(keeper, return_exceptions=True)
-            if isinstance(ended, Exception):
-                raise ended
+        if keeper is None:
+            return None
+        keeper.cancel()
+        (ended,) = await asyncio.gather(keeper, return_exceptions=True)
+        return ended if isinstance(ended, Exception) else None

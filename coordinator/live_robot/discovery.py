@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
 from coordinator.live_robot.messenger import INBOX_BYTES, LANE_BYTES, Clock, Messenger, NoAnswer, Refused
-from coordinator.recording.recording import MAX_MODULES, Entry, Recording
+from coordinator.recording.recording import Entry, Recording
 from module_agent.model.errors import RobotError
 from module_agent.transport.inbox import Inbox
 from module_agent.transport.transport import Event, Liveness, Reply, Sample, Transport
@@ -85,12 +85,14 @@ class _Arrivals:
 
     def get(self, timeout_s: float) -> tuple[int, Event] | None:
         """Return the next event and its time; None if there is none within the time."""
-        # Before the look: what arrives after it sets it again.
-        self._arrived.clear()
-        taken = self._inbox.drain_stamped(limit=1)
-        if not taken and self._arrived.wait(timeout_s):
-            taken = self._inbox.drain_stamped(limit=1)
-        return taken[0] if taken else None
+        end_s = time.monotonic() + timeout_s
+        while True:
+            # Before the look: what arrives after it sets it again. It may be that of an event taken already.
+            self._arrived.clear()
+            if taken := self._inbox.drain_stamped(limit=1):
+                return taken[0]
+            if not self._arrived.wait(max(0.0, end_s - time.monotonic())):
+                return None
 
 
 def _present(transport: Transport, robot: str, search: Search) -> list[str]:
@@ -107,10 +109,8 @@ def _present(transport: Transport, robot: str, search: Search) -> list[str]:
         _, event = arrived
         if isinstance(event, Liveness):
             with suppress(WireError):  # the token of something that is no module
-                serial = parse(event.key).serial
-                if serial in alive or len(alive) < MAX_MODULES:
-                    alive[serial] = event.alive
-                    changed = time.monotonic()
+                alive[parse(event.key).serial] = event.alive
+                changed = time.monotonic()
     declared.undeclare()
     return sorted(serial for serial, present in alive.items() if present)
 

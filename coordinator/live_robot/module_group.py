@@ -151,7 +151,10 @@ class ModuleGroup:
             if serial not in self._messenger.alive and silent_ns > TOKEN_GONE_NS:
                 raise ModuleLost(serial, "its agent has left the network")
             if silent_ns > SILENT_NS:
-                raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s{_trouble(record.status)}")
+                raise ModuleLost(
+                    serial,
+                    f"no feedback for {silent_ns / 1e9:.1f} s{_trouble(self.status_under_lease(serial))}",
+                )
             self.commander.check_lease(serial)
             status = self.status_under_lease(serial)
             if status is not None and status.state == "stopped":
@@ -192,14 +195,18 @@ class ModuleGroup:
 
     # ------------------------------------------------------------------ leases
 
+    async def acquire_all(self) -> None:
+        """Take the leases of all modules; see `acquire`."""
+        await self.acquire(*self.serials)
+
     async def acquire(self, *serials: str) -> None:
-        """Take the leases of modules, all by default, which arms them; they are renewed until given back.
+        """Take the leases of modules, which arms them; they are renewed until given back.
 
         Raises:
             Refused: another sender holds one; the message names the holder and the time left. The others are
                 held.
         """
-        await gather_all(self.commander.acquire(serial) for serial in serials or self.serials)
+        await gather_all(self.commander.acquire(serial) for serial in serials)
 
     def forget_lease(self, serial: str) -> None:
         """Renew the lease of a module no more, which lapses then, and expect nothing of it."""

@@ -49,7 +49,7 @@ class ShortSession:
             group = self._group
             gains = chosen([group.info(serial).gains for serial in group.serials])
             try:
-                await group.acquire()
+                await group.acquire_all()
                 await gather_all(
                     group.set_gains(serial, own, keep=True)
                     for serial, own in zip(group.serials, gains, strict=True)

@@ -109,7 +109,7 @@ class LiveStates:
         group = self._group = ModuleGroup(self._messenger, self._states.recording, self._clock, self._sender)
         try:
             await group.meet(sorted(self._messenger.alive))
-            await group.acquire()
+            await group.acquire_all()
         except RobotError:
             await self._release()
             raise

@@ -24,7 +24,7 @@ from module_agent.wire.information_messages import Information, InformationReque
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, Estimate, Feedback, Info, Message, Status
 from module_agent.wire.refusal import Refusal, WireError
-from module_agent.wire.row_log import RowLog
+from module_agent.wire.row_log import MAX_ROWS, RowLog
 from module_agent.wire.topics import TOPICS, Exchange
 
 P = ParamSpec("P")
@@ -35,8 +35,8 @@ JOURNAL_TOPIC = "journal"
 MAX_OPEN_REQUESTS = 4096
 # Of one module in one session, and of modules: what is beyond is made up, and is not to fill the memory.
 MAX_BOOTS, MAX_MODULES = 32, 1024
-# Of all modules together, 6.8 GB: more than seven full logs of rows, or 17 min of 256 modules at 250 Hz.
-MAX_ROWS_OF_ALL = 1 << 26
+# Of all modules together, 27 GB: full logs of rows of 67 modules, or 70 min of 256 modules at 250 Hz.
+MAX_ROWS_OF_ALL = 1 << 28
 # Of a boot that has not answered a question, which may be made up: 16 s at 250 Hz, in 0.4 MB.
 STRANGER_ROWS = 4096
 # Of one joint by one module: motions that it was estimated from.
@@ -216,6 +216,22 @@ class Recording:
             kept = STRANGER_ROWS if self.modules[module.serial] is module else 0
             if module.rows.end_row - module.rows.first_row > 1.1 * kept:
                 module.forget(kept, kept)
+
+    def check_room_for(self, serials: Iterable[str], duration_s: float) -> None:
+        """Check that the feedback of modules can be kept for so long, before a session that needs all of it.
+
+        Raises:
+            RecordingFull: it cannot.
+        """
+        modules = [self.modules[serial] for serial in serials]
+        rates_hz = [0.0 if one.info is None else one.info.feedback_rate_hz for one in modules]
+        rows = [one.rows.count + rate * duration_s for one, rate in zip(modules, rates_hz, strict=True)]
+        if max(rows, default=0.0) > MAX_ROWS or sum(rows) > MAX_ROWS_OF_ALL:
+            raise RecordingFull(
+                f"the session takes {duration_s / 60.0:.3g} min and makes {sum(rows):.3g} feedback rows of "
+                f"{len(modules)} modules; at most {MAX_ROWS_OF_ALL}, {MAX_ROWS} of each, are kept in memory: "
+                "plan fewer or shorter motions, or give the agents a lower --feedback-rate"
+            )
 
     def check_room(self, serials: Iterable[str]) -> None:
         """Check that the next feedback of modules can be kept, for sessions that need all of it.

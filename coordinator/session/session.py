@@ -129,6 +129,7 @@ class Session:
 
         Raises:
             ModulesJoined: modules came that are not expected.
+            RecordingFull: its feedback would not fit into the memory; nothing has moved.
         """
         await self._discover(expect)
         self._report("checking the network")
@@ -138,6 +139,7 @@ class Session:
         self._repeat_journeys()
         self._starts = {s: self._position(s) for s in self.group.serials}
         self._times = self._expected()
+        self._recording.check_room_for(self.group.serials, self._times.left_s)
         try:
             await self._arm()
             while True:

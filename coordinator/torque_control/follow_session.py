@@ -136,7 +136,7 @@ class FollowSession:
         check_motion_limits(self._model, reference, [info.limits for info in infos])
         self._stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in infos)
         try:
-            await self._group.acquire()
+            await self._group.acquire_all()
             measured = [await self._mode(mode, reference) for mode in self._plan.modes]
             await self._go(stood_rad)
             await self._group.release_all()

@@ -26,9 +26,11 @@ from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.preconditions import check_gravity, find_robot
 from coordinator.torque_control.streamed_states import StreamedStates
 from coordinator.torque_control.summary import CompensationSummary, CompensationTally
+from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array
 from module_agent.transport.transport import Transport
 from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.messages import GainSet
 
 # The oldest feedback to act on, as a share of the command lifetime: modules refuse commands that echo older
 # feedback.
@@ -145,7 +147,7 @@ class CompensationSession:
         if self._asked:
             return self._tally.summary(self._asked, is_fault=False)
         try:
-            await self._group.acquire()
+            await self._group.acquire_all()
             self._streaming = asyncio.create_task(self._stream(compensator))
             await self._compensate(compensator)
             await self._return(compensator, stood.q_rad)
@@ -170,10 +172,7 @@ class CompensationSession:
             # Only while it is held: an IMU in free fall measures no gravity.
             self._check_gravity()
             damping = self._plan.settings.damping_nm_s_rad
-            await gather_all(
-                self._group.set_gains(s, compensation_gains(self._group.kind(s), damping))
-                for s in self._serials
-            )
+            await self._set_gains(lambda kind: compensation_gains(kind, damping))
             self._is_under_torque = True
             compensator.release(self._now_s())
             await self._until(lambda: not compensator.is_in("releasing") or bool(self._asked))
@@ -185,9 +184,17 @@ class CompensationSession:
         self._screen.note(f"holding: {compensator.why}")
         await self._until(lambda: compensator.is_in("held"))
         if self._is_under_torque:
-            await gather_all(
-                self._group.set_gains(s, holding_gains(self._group.kind(s))) for s in self._serials
-            )
+            await self._set_gains(holding_gains)
+
+    async def _set_gains(self, gains: Callable[[ModuleType], GainSet]) -> None:
+        """Give every joint its gains, as long as the set-points go on meanwhile."""
+        work = (self._group.set_gains(s, gains(self._group.kind(s))) for s in self._serials)
+        given = asyncio.create_task(gather_all(work))
+        try:
+            await self._until(given.done)
+        finally:
+            await _cancelled(given)
+        given.result()
 
     def _is_over(self, compensator: GravityCompensator) -> bool:
         over = self._plan.for_s is not None and self._tally.compensated_s >= self._plan.for_s

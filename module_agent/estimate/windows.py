@@ -83,10 +83,11 @@ def even(window: Samples, step_ns: float = STEP_NS) -> Samples:
         raise DataError(
             f"a hole of {1e-6 * steps.max():.0f} ms; at most {1e-6 * MAX_HOLE_NS:.0f} are bridged"
         )
-    count = int(t_ns[-1] - t_ns[0]) / max(step_ns, 1.0)
-    if count > MAX_EVEN_SAMPLES:
+    # As integers of any size: differences of times may be longer than 63 bits.
+    span_ns = int(t_ns[-1]) - int(t_ns[0])
+    if span_ns > MAX_EVEN_SAMPLES * max(step_ns, 1.0):
         raise DataError(
-            f"{t_ns.size} samples over {1e-9 * (t_ns[-1] - t_ns[0]):.1f} s, most of them "
+            f"{t_ns.size} samples over {1e-9 * span_ns:.1f} s, most of them "
             f"{1e-6 * step_ns:.3g} ms apart: at most {MAX_EVEN_SAMPLES} even ones are made of them"
         )
     at_ns = np.arange(t_ns[0], t_ns[-1] + 1, round(step_ns))

@@ -40,7 +40,7 @@ async def _explore(group: Any, joint: str) -> None:
     """The motions of an exploration, without all else that a session does."""
     await asyncio.sleep(0.2)
     await group.meet([BASE, TIP])
-    await group.acquire()
+    await group.acquire_all()
     await group.run(dict.fromkeys(group.serials, Rest(duration_s=1.0)))
     for pattern in (
         GoTo(target_rad=-0.45, max_speed_rad_s=1.2),

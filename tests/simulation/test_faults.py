@@ -346,10 +346,21 @@ def test_messages_on_made_up_keys_neither_end_a_session_nor_keep_its_stop_back(
 def test_a_session_whose_rows_fill_the_memory_stops_the_robot_and_says_of_which_module(
     rigs: Rigs, quick_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # 12 s at 250 Hz; in full an hour at 1 kHz.
+    # 12 s at 250 Hz; in full an hour at 1 kHz. It takes longer than was expected.
     monkeypatch.setattr("module_agent.wire.row_log.MAX_ROWS", 3000)
     rig = rigs(ARM, "lan", 1)
     with pytest.raises(RecordingFull, match=rf"of module ({BASE}|{TIP}) .* rows of it, 0\.1.. min at 250 Hz"):
         rig.session(tmp_path / "run", quick_plan)
     assert {rig.state(serial) for serial in rig.serials} == {"stopped"}
     assert load_recording(tmp_path / "run" / "session.mcap").journal[-1].what == "failed"
+
+
+@pytest.mark.parametrize("bound", ["MAX_ROWS", "MAX_ROWS_OF_ALL"])
+def test_a_session_whose_rows_would_not_fit_into_the_memory_moves_nothing(
+    rigs: Rigs, quick_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str
+) -> None:
+    monkeypatch.setattr(f"coordinator.recording.recording.{bound}", 2000)
+    rig = rigs(ARM, "lan", 1)
+    with pytest.raises(RecordingFull, match=r"the session takes 0\.\d+ min and makes \S+ rows .* 2 modules"):
+        rig.session(tmp_path / "run", quick_plan)
+    assert {rig.state(serial) for serial in rig.serials} == {"idle"}

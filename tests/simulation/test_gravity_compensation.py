@@ -262,6 +262,31 @@ def test_when_an_agent_dies_the_others_are_told_to_stop_and_it_is_named(rigs: Ca
     assert seen.notes[-1].startswith("stopped: module elbow: newest feedback is ")
 
 
+def test_an_agent_that_hangs_while_gains_are_given_is_noticed_by_its_feedback(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not when its answer is overdue: the other joints follow the last torques as long as that takes."""
+    rig = rigs(ARM, "lan")
+    floating, _ = session(rig)
+    set_gains, hung_s, stopped_s = floating._group.set_gains, list[float](), list[float]()
+
+    async def hanging(serial: str, *what: Any) -> None:
+        if not hung_s:
+            hung_s.append(rig.loop.time())
+            rig.freeze(ELBOW)
+        await set_gains(serial, *what)
+
+    def watch() -> None:
+        if rig.state(LIFT) == "stopped" and not stopped_s:
+            stopped_s.append(rig.loop.time())
+
+    monkeypatch.setattr(floating._group, "set_gains", hanging)
+    rig.on_tick.append(watch)
+    with pytest.raises(StaleFeedback, match=f"module {ELBOW}: newest feedback is 20"):
+        rig.run(floating.run())
+    assert stopped_s[0] - hung_s[0] < 0.25
+
+
 def test_somebody_elses_stop_ends_it_and_is_not_overruled(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     floating, seen = session(rig)

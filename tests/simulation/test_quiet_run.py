@@ -74,7 +74,7 @@ def life(rigs: Callable[..., Any], seed: int, observed: bool = False) -> tuple[s
     async def move(target_rad: float) -> None:
         await asyncio.sleep(0.1)
         await group.meet(rig.serials)
-        await group.acquire()
+        await group.acquire_all()
         with suppress(RobotError):
             for serial in rig.serials:
                 await group.run({serial: GoTo(target_rad=target_rad, max_speed_rad_s=1.0)})

@@ -114,7 +114,7 @@ async def move_about(
         await asyncio.sleep(0.05)
     await group.meet(sorted(messenger.alive))
     await asyncio.sleep(0.3)
-    await group.acquire()
+    await group.acquire_all()
     turn = 0
     while loop.now_ns < until_ns:
         motion = motions[turn % len(motions)]
@@ -126,5 +126,5 @@ async def move_about(
             await group.run(dict(motion.patterns))
         except MotionInterrupted:
             # A collision may make a module drop its lease; the mover acquires it again.
-            await group.acquire()
+            await group.acquire_all()
     await group.release_all()

@@ -1,6 +1,7 @@
 """Waiting for modules: by the liveliness tokens on the network, on the session's clock."""
 
 import asyncio
+import threading
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -56,13 +57,13 @@ class _Flooded:
 
     def watch_alive(self, expression: str, sink: Callable[[Event], None]) -> Any:
         robot = expression.split("/")[1]
-        for serial in ("A", *(f"M{number}" for number in range(self.tokens))):
+        for serial in (*(f"M{number}" for number in range(self.tokens)), "Z"):
             sink(Liveness(key(robot, serial, Leaf.ALIVE), True))
         return SimpleNamespace(undeclare=lambda: None)
 
     def subscribe(self, expression: str, sink: Callable[[Event], None]) -> None:
         for _ in range(self.messages):
-            sink(Sample(key(expression.split("/")[1], "A", Leaf.FEEDBACK), bytes(20_000)))
+            sink(Sample(key(expression.split("/")[1], "Z", Leaf.FEEDBACK), bytes(20_000)))
 
     def query(
         self, at: str, payload: bytes, timeout_s: float, sink: Callable[[Event], None], tag: int
@@ -75,15 +76,35 @@ class _Flooded:
 SHORT = discovery.Search(quiet_s=0.01, first_s=0.01)
 
 
-def test_tokens_that_were_made_up_are_as_many_as_a_robot_may_have() -> None:
+def test_a_module_among_tokens_that_were_made_up_is_asked_as_well() -> None:
+    """So that none keeps a module from being stopped."""
     _, silent = discovery.described(_Flooded(MAX_MODULES + 500, 0), "robot", SHORT)  # type: ignore[arg-type]
-    assert len(silent) == MAX_MODULES
-    assert "A" in silent
+    assert len(silent) == MAX_MODULES + 501
+    assert "Z" in silent
+
+
+def test_a_late_sign_of_an_event_that_was_taken_does_not_end_the_wait_for_the_next() -> None:
+    """As of a thread that is interrupted between both."""
+    arrivals, token = discovery._Arrivals(), Liveness(key("robot", "A", Leaf.ALIVE), True)
+    arrivals.put(token)
+    assert arrivals.get(1.0) is not None
+    wait = arrivals._arrived.wait
+
+    def late(timeout: float | None = None) -> bool:
+        arrivals._arrived.wait = wait  # type: ignore[method-assign]
+        # The sign of the first event comes now, and the second event 50 ms later.
+        threading.Timer(0.05, arrivals.put, (token,)).start()
+        return True
+
+    arrivals._arrived.wait = late  # type: ignore[method-assign]
+    found = arrivals.get(5.0)
+    assert found is not None
+    assert found[1] == token
 
 
 def test_what_arrives_while_modules_are_listed_is_kept_up_to_a_bound() -> None:
     found = discovery.listed(_Flooded(0, 3000), "robot", SHORT, listen_s=0.5)  # type: ignore[arg-type]
-    assert found.silent == ["A"]
+    assert found.silent == ["Z"]
     # 60 MB are sent; of one key no more waits than an inbox has room for.
     assert found.recording.refused["malformed"] <= LANE_BYTES // 20_000
 

@@ -44,7 +44,7 @@ async def _met(group: ModuleGroup, *serials: str) -> None:
 
 async def _armed(group: ModuleGroup, *serials: str) -> None:
     await _met(group, *serials)
-    await group.acquire()
+    await group.acquire_all()
 
 
 def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Callable[..., Any]) -> None:
@@ -122,7 +122,7 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
                     break
                 except MotionInterrupted:
                     interrupted += 1
-                    await group.acquire()
+                    await group.acquire_all()
         end_rows = {serial: recording.modules[serial].rows.end_row for serial in group.serials}
         await group.complete_rows()
         await group.release_all()
@@ -208,7 +208,7 @@ def test_of_many_modules_eight_in_turn_answer_a_keep_alive_and_all_stay_held(
 
     async def work() -> None:
         await _met(group, *rig.serials)
-        await group.acquire()
+        await group.acquire_all()
         await asyncio.sleep(0.5)
         said.clear()
         await group.wait(lambda: False, 50 * KEEP_ALIVE_S)
@@ -236,7 +236,7 @@ def test_on_a_poor_network_each_of_many_running_motions_is_commanded_again_and_i
 
     async def work() -> None:
         await _met(group, *rig.serials)
-        await group.acquire()
+        await group.acquire_all()
         await group.wait(lambda: group.is_poor, 5.0)
         running = asyncio.create_task(group.run(dict.fromkeys(rig.serials, Rest(duration_s=3.0))))
         await asyncio.sleep(0.5)
@@ -262,7 +262,7 @@ def test_of_many_modules_too_a_lease_that_is_taken_is_noticed(rigs: Callable[...
     async def work() -> None:
         for group in (first, second):
             await _met(group, *rig.serials)
-        await first.acquire()
+        await first.acquire_all()
         taken = rig.serials[-1]
         with silent(first):
             await asyncio.sleep(1.1)
@@ -314,6 +314,54 @@ def test_a_module_that_another_holds_now_is_not_stopped_with_the_others(rigs: Ca
     rig.run(work())
 
 
+def test_a_module_that_could_not_be_released_is_not_kept_armed_with_the_next_that_is_taken(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM)
+    messenger, _, group = rig.group()
+
+    async def command(serial: str, leaf: Leaf, message: Message, *how: Any) -> Ack:
+        if serial == TIP and isinstance(message, LeaseRequest) and message.action == "release":
+            raise NoAnswer(serial, leaf, "Timeout")
+        return await Messenger.command(messenger, serial, leaf, message, *how)
+
+    monkeypatch.setattr(messenger, "command", command)
+
+    async def work() -> None:
+        await _armed(group)
+        with pytest.raises(NoAnswer):
+            await group.release_all()
+        await group.acquire(BASE)
+        await asyncio.sleep(0.5)
+        assert [rig.state(serial) for serial in (BASE, TIP)] == ["armed", "expired"]
+        # But it is this sender's to stop.
+        assert await group.stop_all("for the test") == []
+        assert [rig.state(serial) for serial in (BASE, TIP)] == ["stopped", "stopped"]
+
+    rig.run(work())
+
+
+def test_an_error_that_ended_the_keep_alives_is_raised_and_keeps_no_module_from_being_stopped(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM)
+    _, _, group = rig.group()
+
+    def broken(**_how: Any) -> None:
+        raise ZeroDivisionError
+
+    async def work() -> None:
+        await _armed(group)
+        monkeypatch.setattr(group.commander, "renew", broken)
+        with pytest.raises(ZeroDivisionError):
+            await group.wait(lambda: False, 1.0)
+        rig.freeze(TIP)
+        assert await group.stop_all("for the test") == [TIP]
+        assert rig.state(BASE) == "stopped"
+
+    rig.run(work())
+
+
 def test_every_module_is_given_a_secret_of_its_own(rigs: Callable[..., Any]) -> None:
     """Who serves one module's lease key, and so reads its secret, commands no other in the holder's name."""
     given: dict[str, set[bytes]] = {BASE: set(), TIP: set()}
@@ -354,7 +402,7 @@ def test_one_renewal_that_cannot_be_sent_does_not_end_those_of_the_others(
 
     async def work() -> None:
         await _met(group, *rig.serials)
-        await group.acquire()
+        await group.acquire_all()
         await asyncio.sleep(1.0)
         assert failed
         assert {rig.state(serial) for serial in rig.serials} == {"armed"}
@@ -514,7 +562,7 @@ def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callab
             with pytest.raises(MotionInterrupted, match=r"refused: .*; it says: no fresh command for 250 ms"):
                 await group.run({BASE: SLOW})
         assert rig.state(BASE) == "expired"
-        await group.acquire()
+        await group.acquire_all()
         assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"
 
     rig.run(work())
@@ -545,7 +593,7 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
         await _armed(group)
         with pytest.raises(MotionInterrupted, match="was expired: use a new number"):
             await group.run({BASE: SLOW})
-        await group.acquire()
+        await group.acquire_all()
         assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"
 
     rig.run(work())
@@ -673,7 +721,7 @@ def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
 
     async def work() -> None:
         await _met(group)
-        await group.acquire()
+        await group.acquire_all()
         both = await group.run({BASE: rest, TIP: rest}, {BASE: ramp})
         after = await group.run({BASE: rest, TIP: rest})
         await group.complete_rows()
@@ -716,7 +764,7 @@ def test_with_slow_renewals_motions_are_commanded_again_and_run_once(
 
     async def work() -> None:
         await _met(group)
-        await group.acquire()
+        await group.acquire_all()
         record = (await group.run({BASE: SLOW}))[BASE]
         assert record.outcome == "done"
         assert group.is_poor == is_poor
@@ -752,7 +800,7 @@ def test_a_motion_during_which_another_joint_expires_is_interrupted(
         with pytest.raises(MotionInterrupted, match=why):
             await group.run({BASE: SLOW})
         # Armed again, both move as before.
-        await group.acquire()
+        await group.acquire_all()
 
     rig.run(work())
 

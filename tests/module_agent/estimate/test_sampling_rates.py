@@ -75,6 +75,15 @@ def test_an_imu_that_is_too_slow_is_refused_with_its_rate(horizontal_link: Any) 
         observed_motions([MotionWindows(*pair, pair[0], 0)])
 
 
+def test_times_further_apart_than_63_bits_are_refused(horizontal_link: Any) -> None:
+    _, joint = horizontal_link._replace(noise=0.0).sine(0.1, 1)
+    t_ns = joint.t_ns.copy()
+    t_ns[: len(t_ns) // 2] -= np.int64(2**62 + 2**61)
+    t_ns[len(t_ns) // 2 :] += np.int64(2**62)
+    with pytest.raises(DataError):
+        even(joint._replace(t_ns=t_ns))
+
+
 @pytest.mark.parametrize("step_ns", [20, 100_000])
 def test_times_that_would_make_millions_of_samples_are_refused_before_they_do(
     horizontal_link: Any, step_ns: int
