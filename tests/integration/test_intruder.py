@@ -311,7 +311,7 @@ def test_with_security_the_robot_identifies_itself_among_intruders(
             one.query(key(ROBOT, serial, Leaf.LEASE), latest, 0.1, lambda event: None, 1)
         for forger in forgers:
             forger.publish()
-        lie(hostile[0], latest)
+        lie(hostile[0], heard[0])
         time.sleep(0.02)
     code, text = programs.ended(coordinator)
     for one in hostile:
