@@ -228,9 +228,9 @@ class Recording:
         rows = [one.rows.count + rate * duration_s for one, rate in zip(modules, rates_hz, strict=True)]
         if max(rows, default=0.0) > MAX_ROWS or sum(rows) > MAX_ROWS_OF_ALL:
             raise RecordingFull(
-                f"the session takes {duration_s / 60.0:.3g} min and makes {sum(rows):.3g} feedback rows of "
-                f"{len(modules)} modules; at most {MAX_ROWS_OF_ALL}, {MAX_ROWS} of each, are kept in memory: "
-                "plan fewer or shorter motions, or give the agents a lower --feedback-rate"
+                f"the session takes {duration_s / 60.0:.3g} min and makes {sum(rows):.0f} feedback rows of "
+                f"{len(modules)} modules; at most {MAX_ROWS_OF_ALL}, and {MAX_ROWS} of each, are kept in "
+                "memory: plan fewer or shorter motions, or give the agents a lower --feedback-rate"
             )
 
     def check_room(self, serials: Iterable[str]) -> None:

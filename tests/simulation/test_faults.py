@@ -361,6 +361,6 @@ def test_a_session_whose_rows_would_not_fit_into_the_memory_moves_nothing(
 ) -> None:
     monkeypatch.setattr(f"coordinator.recording.recording.{bound}", 2000)
     rig = rigs(ARM, "lan", 1)
-    with pytest.raises(RecordingFull, match=r"the session takes 0\.\d+ min and makes \S+ rows .* 2 modules"):
+    with pytest.raises(RecordingFull, match=r"takes 0\.\d+ min and makes \d+ feedback rows of 2 modules"):
         rig.session(tmp_path / "run", quick_plan)
     assert {rig.state(serial) for serial in rig.serials} == {"idle"}
