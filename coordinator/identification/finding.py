@@ -23,6 +23,7 @@ Sickness = Literal[
     "effort_sign",
     "effort_stuck",
     "joint_gives",
+    "joint_halted",
     "clock_jump",
     "type_mislabelled",
     "not_finite",

@@ -36,6 +36,10 @@ CLIPPED_SAMPLES, CLIPPED_SIGMAS = 8, 30.0
 CUT_OFF = 5.0
 # A joint turns by this much while its encoder or effort is said to be stuck.
 TURNED_RAD = 0.05
+# A joint that turned by less than this share of its command was held, or its motor failed meanwhile: of all
+# of a motion, and of what is commanded within so long, if that is as much.
+MIN_FOLLOWED = 0.2
+HALTED_S, HALTED_RAD = 0.5, 0.1
 # A position that changes by this much from one sample to the next, and neither before nor after it.
 JUMP_RAD = 0.02
 # Clocks of crystals, and some more; the least leap; steps between rows of this many usual ones are long.
@@ -91,12 +95,14 @@ def sensor_findings(recording: Recording, serials: Sequence[str]) -> tuple[Findi
     heard = [s for s in serials if s not in silent]
     rows = {s: _all_rows(recording.modules[s]) for s in heard}
     beside = {s: _all_rows(module) for s, module in recording.modules.items() if s not in serials}
-    events = [e for e in recording.latest_motions("constant", "windowed_sine", "whole") if e.serial in heard]
+    later = recording.motions("dynamic", "held_out")
+    events = [*recording.latest_motions("constant", "windowed_sine", "whole"), *later]
     return (
         *(_silent(s) for s in silent),
         *_inertial(rows, {s: recording.rest_rows(s) for s in heard}),
         *(one for s in heard for one in _gravity(s, recording.rest_rows(s)["accel_m_s2"].astype(float))),
         *(one for s in heard for one in _joint(s, [e for e in events if e.serial == s], recording)),
+        *(one for s in heard for one in _halted(s, [e for e in later if e.serial == s], recording)),
         *(one for s, own in (rows | beside).items() for one in _jumps(s, own)),
         *_clocks(recording, rows),
         *_not_finite(recording, serials),
@@ -267,6 +273,49 @@ def _joint(serial: str, events: Sequence[JournalEvent], recording: Recording) ->
                     kind,
                     True,
                 )
+
+
+def _halted(serial: str, events: Sequence[JournalEvent], recording: Recording) -> Iterable[Finding]:
+    """Yield a joint that stood in a motion for inertia or of the check, where it did so most clearly.
+
+    What it carries shows in its own torques only as far as it moves.
+    """
+    worst: Finding | None = None
+    for event in events:
+        if event.motion is None or event.motion.end_row is None:
+            continue
+        rows = recording.rows(serial, event.motion.start_row, event.motion.end_row)
+        for turned_rad, wanted_rad in _spans(rows):
+            if turned_rad >= MIN_FOLLOWED * wanted_rad or wanted_rad < HALTED_RAD:
+                continue
+            if worst is None or wanted_rad - turned_rad > worst.expected - worst.measured:
+                worst = Finding(
+                    serial,
+                    f"its {event.purpose} motion",
+                    f"the way that it turned within {HALTED_S:g} s",
+                    turned_rad,
+                    wanted_rad,
+                    (wanted_rad - turned_rad) / JUMP_RAD,
+                    "rad",
+                    "its motor is dead, or something held the joint",
+                    "joint_halted",
+                    True,
+                )
+    if worst is not None:
+        yield worst
+
+
+def _spans(rows: Rows) -> list[tuple[float, float]]:
+    """Return the ranges of position and of its command [rad] in each `HALTED_S` of rows without a hole."""
+    samples = round(HALTED_S / step_s) if (step_s := _step_s(rows["t_ns"].astype(np.int64))) else 0
+    if samples < 2 or len(rows) < samples:
+        return []
+    whole = len(rows) - len(rows) % samples
+    columns = [
+        rows[n][:whole].astype(float).reshape(-1, samples) for n in ("position_rad", "position_command_rad")
+    ]
+    spans = np.stack([np.ptp(column, axis=1) for column in columns], axis=1)
+    return [(turned, wanted) for turned, wanted in spans[np.isfinite(spans).all(axis=1)].tolist()]
 
 
 def _jumps(serial: str, rows: Rows) -> Iterable[Finding]:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.identification.signal_checks import MIN_FOLLOWED
 from coordinator.identification.topology_observations import (
     ObservedMotions,
     observe,
@@ -28,9 +29,6 @@ from coordinator.topology.topology import (
 )
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
-
-# A joint that turned by less than this share of its command was held, or its motor failed meanwhile.
-MIN_FOLLOWED = 0.2
 
 
 class TopologyFound(NamedTuple):

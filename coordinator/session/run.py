@@ -541,7 +541,8 @@ class Run:
             kinematics = await self._kinematics()
         except IdentificationError:
             return None  # reported when everything is identified from the complete recording
-        await self._requests.ask(kinematics.fit.chain, kinematics.clocks)
+        if kinematics.dynamic:
+            await self._requests.ask(kinematics.fit.chain, kinematics.clocks)
         with contextlib.suppress(NoAnswer, Refused, ModuleLost):
             await self._group.close_gaps()
         return kinematics
