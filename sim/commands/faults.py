@@ -21,7 +21,7 @@ from sim.commands.options import load
 from sim.faults.fault import Fault, fault_of
 from sim.faults.invariants import NO_LINK, VAGUE_DEG, VAGUE_MM
 from sim.faults.report import OUTCOMES, SeedReport, by_fault, lost_seed, run_seed
-from sim.faults.schedule import Schedule, draw, first_modules
+from sim.faults.schedule import PlanName, Schedule, draw, first_modules
 from sim.physics.engine import Physics
 from sim.thesis.experiment import Unit
 from sim.thesis.study import Store, key
@@ -52,6 +52,9 @@ def faults(
             help="Tell the coordinator how many modules there are, or do not [drawn].", show_default=False
         ),
     ] = None,
+    plan: Annotated[
+        PlanName | None, typer.Option(help="What the coordinator plans [drawn].", show_default=False)
+    ] = None,
     shrink: Annotated[bool, typer.Option(help="Make what violates an invariant simpler.")] = True,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
@@ -72,7 +75,8 @@ def faults(
     """
     numbers = seed_range(seeds)
     schedules = [
-        _schedule(seed, robot, modules, network, fault, expect)._replace(physics=physics) for seed in numbers
+        _schedule(seed, robot, modules, network, fault, expect, plan)._replace(physics=physics)
+        for seed in numbers
     ]
     units = [
         Unit(f"seed {one.seed}", run_seed, (one, shrink), kind=SeedReport, cost_s=COST_S) for one in schedules
@@ -170,13 +174,14 @@ def _schedule(
     network: str | None,
     faults: list[str] | None,
     expect: bool | None,
+    plan: PlanName | None,
 ) -> Schedule:
     chosen = None if robot is None else load(robot)
     if chosen is not None and modules is not None:
         chosen = first_modules(chosen, modules)
-    schedule = draw(seed, chosen)
+    schedule = draw(seed, chosen, plan)
     if chosen is None and modules is not None:
-        schedule = draw(seed, first_modules(schedule.robot, modules))
+        schedule = draw(seed, first_modules(schedule.robot, modules), plan)
     if network is not None:
         check_network(network)
         schedule = schedule._replace(network=network)

@@ -37,8 +37,8 @@ _REQUESTS: dict[Leaf, type[LeaseRequest] | type[MotionCommand] | type[GainsComma
 _STREAMING = STATE_NAMES.index("streaming")
 # Below this the sign of a speed is that of its noise on a springy joint [rad/s].
 SLOW_RAD_S = 0.05
-# Of a motor, seen at the output, over the speed of its type: loops overshoot their clamps. The output swings
-# about that speed on its spring.
+# Of a motor, seen at the output, over the speed of its type or its configuration: loops overshoot their
+# clamps. The output swings about that speed on its spring.
 SPEED_MARGIN = 1.25
 # How far a motor may drive its joint on beyond a limit of its position: what the encoder errs by, and a joint
 # that is led back against its load is let down and pushed again. The way that braking takes is no driving.
@@ -89,15 +89,20 @@ class PlantWitness:
     Args:
         commanders: the names of endpoints on the network that may command, and in whose name each does.
         ranges: the configured range of position of each module that is to keep it, by serial [rad].
+        speeds: the configured speeds of modules that have one, by serial [rad/s].
     """
 
     def __init__(
-        self, commanders: Mapping[str, str], ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
+        self,
+        commanders: Mapping[str, str],
+        ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+        speeds: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.violations: dict[str, str] = {}
         self.seen_until_ns = 0
         self._commanders = commanders
         self._ranges = ranges
+        self._configured_rad_s = speeds
         # How far each joint has been driven on since it left its range.
         self._outward_rad = dict.fromkeys(ranges, 0.0)
         # For how many ticks each motor has been driven that is too hot.
@@ -240,15 +245,22 @@ class PlantWitness:
 
     def _usual_of(self, robot: VirtualRobot) -> "_Usual":
         """Return what no check finds anything in."""
-        speeds = [module_type(module.type).max_speed_rad_s for module in robot.robot.modules]
+        speeds = self._max_speeds(robot)
         ends = np.array([self._ranges.get(serial, (-np.inf, np.inf)) for serial in robot.serials])
         bounded = np.isfinite(ends[:, 0])
-        centre, reach = np.zeros((2, len(_LOOKED_AT), len(speeds)))
-        reach[0], reach[1] = MAX_PWM, SPEED_MARGIN * np.array(speeds)
+        centre, reach = np.zeros((2, len(_LOOKED_AT), speeds.size))
+        reach[0], reach[1] = MAX_PWM, SPEED_MARGIN * speeds
         # Rounding is no reason to look less: a little less than the range.
         centre[2, bounded] = ends[bounded].mean(axis=1)
         reach[2] = np.where(bounded, 0.5 * (1.0 - 1e-9) * (ends[:, 1] - ends[:, 0]), np.inf)
         return _Usual(centre, reach)
+
+    def _max_speeds(self, robot: VirtualRobot) -> Array:
+        """Return the speed of each module's type, or what it is configured to."""
+        configured = self._configured_rad_s
+        return np.array(
+            [configured.get(m.serial, module_type(m.type).max_speed_rad_s) for m in robot.robot.modules]
+        )
 
     def _check_asked(self, serials: Sequence[str], first_ns: int, asked: Array) -> None:
         """Judge what the modules ask their bridges for, (T, n): the plant's bridges clip it."""
@@ -263,7 +275,7 @@ class PlantWitness:
         self._note("PWM out of range", text)
 
     def _check_speeds(self, robot: VirtualRobot, first_ns: int, speeds: Array) -> None:
-        limits = np.array([module_type(module.type).max_speed_rad_s for module in robot.robot.modules])
+        limits = self._max_speeds(robot)
         within = np.abs(speeds) <= SPEED_MARGIN * limits
         if within.all():
             return

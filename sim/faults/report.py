@@ -13,7 +13,7 @@ from module_agent.model.errors import RobotError
 from sim.faults.fault import KINDS, Fault
 from sim.faults.invariants import Claim, FolderCheck, check_folder, is_misnamed
 from sim.faults.run import Ending, run_schedule, witness_of
-from sim.faults.schedule import Schedule, simpler
+from sim.faults.schedule import PlanName, Schedule, simpler
 from sim.physics.engine import Physics
 from sim.virtual_time.loop import NS_PER_S
 
@@ -42,8 +42,8 @@ MAX_SHRINKING = 20
 class SeedReport(NamedTuple):
     """What became of a seed.
 
-    modules, network, faults, physics, expects: the session, so that it can be run again. kinds: of the faults
-    that had begun by its end.
+    modules, network, faults, physics, expects, planned: the session, so that it can be run again.
+    kinds: of the faults that had begun by its end.
     outcome: the right robot with exit code 0, or one whose claims are so wide that it says little; a result
     called suspect that is right within its claims, that is wrong, or that is wrong where none of its
     suspicions is; an error that names what may have happened, or accuses a healthy module; stopped with its
@@ -67,6 +67,7 @@ class SeedReport(NamedTuple):
     simplest: "SeedReport | None" = None
     physics: Physics = "compiled"
     expects: bool = True
+    planned: PlanName = "short"
     claim: Claim | None = None
     wrong: str = ""
 
@@ -77,7 +78,7 @@ class SeedReport(NamedTuple):
         expect = "--expect" if self.expects else "--no-expect"
         return (
             f"--seeds {self.seed}..{self.seed} --robot {robot or self.robot} --modules {self.modules} "
-            f"--network {self.network}{engine} {expect}{faults}"
+            f"--network {self.network}{engine} {expect} --plan {self.planned}{faults}"
         )
 
 
@@ -141,7 +142,7 @@ def _judged(schedule: Schedule) -> SeedReport:
             violations["traceback"] = _described(error)
         if logged:
             violations.setdefault("traceback", f"logged: {_described(logged[0])}")
-        checked = check_folder(Path(folder) / "run", ending)
+        checked = check_folder(Path(folder) / "run", ending, schedule.untimed)
         violations |= witness.violations | checked.violations
     begun = tuple(fault for fault in schedule.faults if fault.begins_s <= ending.at_s)
     # What was still to come has done nothing.
@@ -170,6 +171,7 @@ def _report(
         violations=violations,
         physics=schedule.physics,
         expects=schedule.expects,
+        planned=schedule.planned,
     )
 
 

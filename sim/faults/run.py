@@ -14,7 +14,6 @@ from coordinator.live_robot.messenger import Sender
 from coordinator.recording.run_folder import RESULT, SESSION
 from coordinator.runtime.event_loop import end_tasks
 from coordinator.session.run import Run, RunConfig
-from module_agent.control.safety import Safety
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network
@@ -24,18 +23,18 @@ from sim.faults.faulty_robot import BEGINNINGS, FaultyRobot
 from sim.faults.intruder import ATTACKS, OVERHEARD, Intruder
 from sim.faults.plant_witness import PlantWitness
 from sim.faults.reckless_holder import RecklessHolder, Target
-from sim.faults.schedule import Schedule, position_ranges
+from sim.faults.schedule import Schedule, position_ranges, safety, speed_limits
 from sim.virtual_time.cable import Cable, CableState
 from sim.virtual_time.loop import NS_PER_S, VirtualLoop
 from sim.virtual_time.network import Tap, VirtualNetwork
 from sim.virtual_time.robot import VirtualSettings
-from sim.virtual_time.run import QUICK_PLAN, SilentScreen
+from sim.virtual_time.run import SilentScreen
 from sim.world.truth import write_truth
 
 COORDINATOR, SUCCESSOR, RECKLESS = "coordinator", "successor", "reckless holder"
 SECRET = b"a-secret-of-16-b"
-# Four joints take 30 s; every motion may be repeated twice, and a run be resumed.
-LIMIT_S = 180.0
+# Four joints take 30 s, 75 s with inertia; every motion may be repeated twice, and a run be resumed.
+LIMIT_S = 300.0
 # How long motors are observed after the coordinator has ended: several lifetimes.
 AFTERWARDS_S = 1.0
 # Endings that leave a result.
@@ -75,9 +74,8 @@ def witness_of(schedule: Schedule) -> PlantWitness:
     # A range is that of the module's own encoder.
     blind = {serials[fault.module] for fault in faults if fault.nature.part == "encoder"}
     ranges = {serial: ends for serial, ends in position_ranges(schedule).items() if serial not in blind}
-    return PlantWitness(
-        {name: name for name in (COORDINATOR, SUCCESSOR)} | dict.fromkeys(reckless, COORDINATOR), ranges
-    )
+    commanders = {name: name for name in (COORDINATOR, SUCCESSOR)} | dict.fromkeys(reckless, COORDINATOR)
+    return PlantWitness(commanders, ranges, speed_limits(schedule))
 
 
 def _reckless(fault: Fault) -> str:
@@ -97,14 +95,13 @@ def run_schedule(schedule: Schedule, out: Path, witness: PlantWitness) -> Ending
         for each in taps:
             each(now_ns, endpoint, kind, key, payload)
 
-    safety = {s: Safety(position_rad=range_rad) for s, range_rad in position_ranges(schedule).items()}
     settings = VirtualSettings(
         schedule.robot,
         network(schedule.network),
         schedule.seed,
         "x5",
         physics=schedule.physics,
-        safety=safety,
+        safety=safety(schedule),
     )
     robot = FaultyRobot(settings, loop, VirtualNetwork(loop, tap), schedule.faults)
     session = _Session(schedule, robot, out, taps)
@@ -159,6 +156,8 @@ class _Session:
         limit_file_size(None)
         if ending.name in WITH_RESULT:
             write_truth(self._out / "truth.json", robot.world.robot)
+            if self._schedule.plan.dynamics:
+                robot.truth.save(self._out / "truth.npz")
         return ending
 
     def witnessed(
@@ -175,7 +174,7 @@ class _Session:
             robot=robot.robot.name,
             out=self._out,
             sender=Sender(self._sender, SECRET),
-            plan=QUICK_PLAN,
+            plan=self._schedule.plan,
             expect=len(robot.serials) if self._schedule.expects else None,
             resume=resume,
             inline=True,

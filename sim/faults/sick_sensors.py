@@ -79,8 +79,8 @@ class SickSensors:
 
 
 def _sized(fault: Fault, largest: float) -> float:
-    """Return a size between a tenth of the largest and the largest."""
-    return largest * (0.1 + 0.9 * fault.size)
+    """Return a size from a hundredth of the largest on: as many of one order of magnitude as of the other."""
+    return float(largest * 10.0 ** (2.0 * fault.size - 2.0))
 
 
 def _clock_forward(own: Alteration, one: _Sickness, t_ns: int, place: int) -> None:
@@ -104,7 +104,8 @@ def _clock_stuck(own: Alteration, one: _Sickness, t_ns: int, place: int) -> None
 
 
 def _clock_drift(own: Alteration, one: _Sickness, t_ns: int, place: int) -> None:
-    rate = (1.0 if one.fault.size < 0.5 else -1.0) * _sized(one.fault, DRIFT)
+    # Small and large ones are both fast and slow.
+    rate = (1.0 if round(1e3 * one.fault.size) % 2 else -1.0) * _sized(one.fault, DRIFT)
     if t_ns < one.end_ns:
         own.drifts[place] = one.fault.module, rate, one.begin_ns
     else:

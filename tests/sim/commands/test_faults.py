@@ -20,7 +20,7 @@ from sim.faults.invariants import Claim, FolderCheck
 from sim.faults.plant_witness import PlantWitness
 from sim.faults.report import run_seed
 from sim.faults.run import Ending
-from sim.faults.schedule import Schedule, draw
+from sim.faults.schedule import PLANS, Schedule, draw
 from sim.main import app
 
 
@@ -34,7 +34,9 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         return Ending("result")
 
     monkeypatch.setattr(report, "run_schedule", run_schedule)
-    monkeypatch.setattr(report, "check_folder", lambda out, ending: FolderCheck({}, Claim("A - B", 1.5, 0.3)))
+    monkeypatch.setattr(
+        report, "check_folder", lambda out, ending, untimed: FolderCheck({}, Claim("A - B", 1.5, 0.3))
+    )
     monkeypatch.setattr(faults, "run_trials", one_after_another)
 
 
@@ -129,7 +131,7 @@ def test_results_that_are_not_plainly_right_have_columns_of_their_own(
 ) -> None:
     document = tmp_path / "faults.json"
     monkeypatch.setattr(report, "run_schedule", lambda *of: Ending(name, "C: its gyro", 60.0))
-    monkeypatch.setattr(report, "check_folder", lambda out, ending: checked)
+    monkeypatch.setattr(report, "check_folder", lambda out, ending, untimed: checked)
     options = ["faults", "--seeds", "7..7", "--no-shrink"]
     found = CliRunner().invoke(app, options)
     assert found.exit_code == (EXIT_FINDING if outcome == "violation" else 0)
@@ -176,6 +178,14 @@ def test_whether_modules_are_counted_is_drawn_or_chosen(
     document = tmp_path / "faults.json"
     CliRunner().invoke(app, ["faults", "--seeds", "0..19", "--no-shrink", "--json", str(document), *options])
     assert {one["expects"] for one in json.loads(document.read_text())["reports"]} == expects
+
+
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize(("options", "planned"), [(["--plan", "d-optimal"], {"d-optimal"}), ([], set(PLANS))])
+def test_what_is_planned_is_drawn_or_chosen(tmp_path: Path, options: list[str], planned: set[str]) -> None:
+    document = tmp_path / "faults.json"
+    CliRunner().invoke(app, ["faults", "--seeds", "0..49", "--no-shrink", "--json", str(document), *options])
+    assert {one["planned"] for one in json.loads(document.read_text())["reports"]} == planned
 
 
 def test_a_dask_cluster_finds_what_this_process_finds(tmp_path: Path) -> None:

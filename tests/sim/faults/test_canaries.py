@@ -26,11 +26,15 @@ from module_agent.hardware.motor_guard import MotorGuard
 from module_agent.wire.messages import MotionCommand, Setpoint
 from sim.faults import run
 from sim.faults.report import run_seed
-from sim.faults.schedule import draw
+from sim.faults.schedule import Schedule, draw
+
+
+def session(seed: int) -> Schedule:
+    return draw(seed, planned="short")
 
 
 def found(seed: int) -> dict[str, str]:
-    return run_seed(draw(seed), shrinks=False).violations
+    return run_seed(session(seed), shrinks=False).violations
 
 
 # The coordinator of two joints is killed in mid motion, and not started again.
@@ -66,14 +70,14 @@ def test_the_build_as_it_is_violates_nothing(seed: int) -> None:
 
 def test_a_right_robot_tells_how_wide_its_claims_are() -> None:
     """Which no invariant bounds: a claim that is wide enough is never wrong."""
-    report = run_seed(draw(HARMLESS))
+    report = run_seed(session(HARMLESS))
     assert report.outcome == "right"
     assert report.claim is not None
-    assert report.claim.link == " - ".join(draw(HARMLESS).robot.serials)
+    assert report.claim.link == " - ".join(session(HARMLESS).robot.serials)
     # Short motions and the catalogue's places of IMUs leave some millimetres, and parts of a degree.
     assert 0.5 < report.claim.mm < 5.0
     assert 0.05 < report.claim.deg < 1.0
-    assert run_seed(draw(FROZEN)).claim is None
+    assert run_seed(session(FROZEN)).claim is None
 
 
 def test_firmware_that_does_not_expire_drives_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,9 +159,9 @@ def test_a_coordinator_that_mixes_up_its_modules_misnames_the_cause(monkeypatch:
         Exception.__init__(error, f"module {other} is lost: {why}")
         error.serial = other
 
-    assert run_seed(draw(FROZEN)).outcome == "named"
+    assert run_seed(session(FROZEN)).outcome == "named"
     monkeypatch.setattr(ModuleLost, "__init__", mixed_up)
-    assert run_seed(draw(FROZEN)).outcome == "misnamed"
+    assert run_seed(session(FROZEN)).outcome == "misnamed"
 
 
 def test_a_guard_that_does_not_bound_the_speed_lets_a_motor_be_too_fast(

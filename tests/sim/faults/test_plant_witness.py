@@ -1,6 +1,7 @@
 """The witness tells a brake from drive by what was stopped and armed, in whatever order messages arrive."""
 
-from types import SimpleNamespace
+from collections.abc import Mapping
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -22,8 +23,8 @@ LATE_NS = LIFETIME_NS + 20 * MS
 class Scene:
     """A coordinator and a module that talk, and what the witness finds long after that."""
 
-    def __init__(self) -> None:
-        self.witness = PlantWitness({HOLDER: HOLDER}, {SERIAL: (-1.0, 0.5)})
+    def __init__(self, speeds: Mapping[str, float] = MappingProxyType({})) -> None:
+        self.witness = PlantWitness({HOLDER: HOLDER}, {SERIAL: (-1.0, 0.5)}, speeds)
         self.now_ns = self._seq = 0
         self.winding_c = 40.0
 
@@ -228,6 +229,16 @@ def test_one_tick_among_many_is_seen(row: int, value: float, kind: str) -> None:
     scene = armed()
     assert scene.looked(seen, scene.now_ns + LATE_NS) == {kind}
     assert scene.looked(np.zeros_like(seen), scene.now_ns + LATE_NS) == {kind}
+
+
+@pytest.mark.parametrize(("configured", "kinds"), [({}, set()), ({SERIAL: 1.2}, {"speed beyond the limit"})])
+def test_no_motor_is_faster_than_its_module_is_configured_to(
+    configured: dict[str, float], kinds: set[str]
+) -> None:
+    scene = Scene(configured)
+    seen = np.zeros((64, SEEN_ROWS, 1))
+    seen[:, PLANT_MOTOR_RAD_S] = 1.6
+    assert scene.looked(seen, scene.now_ns + LATE_NS) == kinds
 
 
 def test_a_motor_may_be_driven_until_two_ticks_after_the_lifetime() -> None:

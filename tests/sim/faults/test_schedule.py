@@ -5,11 +5,22 @@ from typing import Any
 
 import pytest
 
+from module_agent.model.catalogue import module_type
 from module_agent.model.errors import UsageError
 from sim.commands.faults import seed_range
 from sim.faults import schedule
 from sim.faults.fault import KINDS, NATURES, Fault, fault_of
-from sim.faults.schedule import LATEST_S, draw, simpler
+from sim.faults.schedule import (
+    LATEST_DYNAMIC_S,
+    LATEST_S,
+    PLANS,
+    SHARES,
+    SLOWEST,
+    draw,
+    safety,
+    simpler,
+    speed_limits,
+)
 from sim.robot.robot_file import load_robot
 
 SEEDS = range(300)
@@ -28,7 +39,9 @@ def test_a_seed_draws_the_same_session_again_and_another_seed_another() -> None:
 def test_every_kind_of_fault_is_drawn_in_time_and_for_a_module_that_exists(drawn: Any) -> None:
     assert {fault.kind for one in drawn for fault in one.faults} == set(KINDS)
     for one in drawn:
-        assert all(0.0 <= f.at_s <= LATEST_S and f.module < len(one.robot.modules) for f in one.faults)
+        assert all(
+            0.0 <= f.at_s <= LATEST_DYNAMIC_S and f.module < len(one.robot.modules) for f in one.faults
+        )
         assert list(one.faults) == sorted(one.faults, key=lambda fault: fault.at_s)
         assert all(math.isinf(f.for_s) for f in one.faults if f.nature.ends == "never")
         assert not any(math.isinf(f.for_s) for f in one.faults if f.nature.ends == "after")
@@ -37,6 +50,31 @@ def test_every_kind_of_fault_is_drawn_in_time_and_for_a_module_that_exists(drawn
 def test_of_some_sessions_the_coordinator_is_not_told_how_many_modules_there_are(drawn: Any) -> None:
     """A quarter: of 300 these are 75, give or take four standard deviations."""
     assert 45 <= sum(not one.expects for one in drawn) <= 105
+
+
+def test_sessions_of_every_plan_are_drawn_with_faults_to_their_end(drawn: Any) -> None:
+    """Give or take four standard deviations. Without inertia faults come earlier."""
+    for (name, plan), share in zip(PLANS.items(), SHARES, strict=True):
+        count = sum(one.planned == name for one in drawn)
+        assert abs(count - 300.0 * share) <= 4.0 * (300.0 * share * (1.0 - share)) ** 0.5
+        assert draw(7, planned=name).plan == plan
+    dynamic = [one for one in drawn if one.plan.dynamics]
+    assert LATEST_S < max(f.at_s for one in dynamic for f in one.faults) <= LATEST_DYNAMIC_S
+    assert all(f.at_s <= LATEST_S for one in drawn for f in draw(one.seed, planned="short").faults)
+
+
+def test_every_second_module_is_configured_to_a_speed_below_that_of_its_type(drawn: Any) -> None:
+    modules = [(one, module) for one in drawn for module in one.robot.modules]
+    limited = [
+        (speed_limits(one)[m.serial], module_type(m.type).max_speed_rad_s)
+        for one, m in modules
+        if m.serial in speed_limits(one)
+    ]
+    # Give or take four standard deviations.
+    assert abs(len(limited) / len(modules) - 0.5) < 2.0 / len(modules) ** 0.5
+    assert all(SLOWEST * most - 1e-3 <= speed <= most for speed, most in limited)
+    configured = [safety(one)[m.serial].velocity_rad_s[1] for one, m in modules]
+    assert sorted(speed for speed in configured if math.isfinite(speed)) == sorted(s for s, _ in limited)
 
 
 def test_an_added_kind_changes_the_seeds_that_draw_it_and_no_others(
