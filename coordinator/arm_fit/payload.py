@@ -40,6 +40,7 @@ from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from coordinator.parameter_fit.torque_constants import TorqueFactors, torque_factors
 from module_agent.model.chain import Array
 from module_agent.model.errors import UsageError
+from module_agent.model.model_faults import first_fault
 from module_agent.model.regressor import PER_BODY
 
 # The URDF of the baseline may have been written with fewer digits.
@@ -123,8 +124,7 @@ def read_baseline(
             report = FitReport.model_validate_json(Path(source).read_bytes())
         except ValidationError as error:
             raise UsageError(
-                f"{name}: no report of fit-dynamics ({error.error_count()} fields are wrong, the first "
-                f"{'.'.join(map(str, error.errors()[0]['loc'])) or 'its JSON'}); give the file that --json "
+                f"{name}: no report of fit-dynamics ({first_fault(error)}); give the file that --json "
                 "wrote for the arm without the payload"
             ) from None
     part = report.information

@@ -23,7 +23,8 @@ from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import UsageError
 from module_agent.model.forward_kinematics import body_displacements
-from module_agent.model.toml_location import read_toml
+from module_agent.model.model_faults import faults_of
+from module_agent.model.toml_location import fault_lines, read_toml
 from module_agent.wire.messages import ConstantMotion, GoTo, Pattern
 
 # Half an X5's housing, with cables.
@@ -114,13 +115,11 @@ def load_workspace(path: Path) -> Workspace:
     Raises:
         UsageError: the file cannot be read, is not TOML, or is no workspace; the message names the key.
     """
-    table, _ = read_toml(path)
+    table, text = read_toml(path)
     try:
         return Workspace.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{path}: {place}: {first['msg']}".replace(": : ", ": ")) from error
+        raise UsageError(fault_lines(faults_of(error), text, path)) from error
 
 
 class _Body(NamedTuple):

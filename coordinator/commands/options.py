@@ -14,6 +14,7 @@ from coordinator.runtime.command_line import in_a_folder
 from coordinator.runtime.event_loop import check_speed
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.model.errors import UsageError
+from module_agent.model.model_faults import first_fault
 from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.credentials import COORDINATOR, OBSERVER, load_credentials
@@ -167,5 +168,4 @@ def planned(path: Path | None, **given: object) -> Plan:
         # Validated again: an option can be out of range as well.
         return Plan.model_validate({**base.model_dump(), **{k: v for k, v in given.items() if v is not None}})
     except ValidationError as error:
-        first = error.errors()[0]
-        raise UsageError(f"{first['loc'][0]} = {first['input']}: {first['msg']}") from error
+        raise UsageError(first_fault(error)) from error

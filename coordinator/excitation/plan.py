@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import read_toml
+from module_agent.model.model_faults import faults_of
+from module_agent.model.toml_location import fault_lines, read_toml
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
 Mode = Literal["joint", "simultaneous"]
@@ -127,15 +128,13 @@ def load_plan(path: Path) -> Plan:
     Raises:
         UsageError: the file cannot be read, is not TOML, or sets nothing, something unknown or out of range.
     """
-    table, _ = read_toml(path)
+    table, text = read_toml(path)
     if not table:
         raise UsageError(f"{path} sets nothing; for the default plan give none")
     try:
         return Plan.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        fault = f"{name} = {first['input']!r}: {first['msg']}"
-        if first["type"] == "extra_forbidden":
-            fault = f"unknown setting {name}; known are {', '.join(Plan.model_fields)}"
-        raise UsageError(f"{path}: {fault}") from error
+        location, reason = faults_of(error)[0]
+        if location[0] not in Plan.model_fields:
+            reason = f"unknown setting; known are {', '.join(Plan.model_fields)}"
+        raise UsageError(fault_lines([(location, reason)], text, path)) from error

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from module_agent.model.catalogue import ImuKind, TorqueKind
+from module_agent.model.model_faults import first_fault
 from module_agent.wire.messages import MotionRecord
 from module_agent.wire.refusal import Refusal, WireError
 
@@ -61,10 +62,8 @@ class JournalEvent(BaseModel):
         try:
             return cls.model_validate_json(payload)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            place = ".".join(map(str, first["loc"])) or "it"
             raise WireError(
-                Refusal.MALFORMED, f"no event of a journal that this version knows: {place}: {first['msg']}"
+                Refusal.MALFORMED, f"no event of a journal that this version knows: {first_fault(error)}"
             ) from error
 
     def encode(self) -> bytes:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from coordinator.recording.run_folder import RESULT
 from module_agent.model.errors import UsageError
 from module_agent.model.files import replacing, write_json
+from module_agent.model.model_faults import first_fault
 
 VERSIONS, CURRENT, HISTORY = "versions", "current", "history.json"
 FIRST = 1
@@ -113,7 +114,7 @@ class Versions:
         try:
             return _History.model_validate_json(path.read_bytes()).entries
         except ValidationError as error:
-            raise VersionError(f"{path} is no history: {error.errors()[0]['msg']}") from error
+            raise VersionError(f"{path} is no history: {first_fault(error)}") from error
 
     def run_of(self, number: int) -> Path:
         """Return the folder of a version.

@@ -37,6 +37,7 @@ from coordinator.report.result_sections import HALF_95, HeldOutTorques, result_s
 from coordinator.synchronisation.feedback_delays import FeedbackDelay, feedback_delays
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import DataError, UsageError
+from module_agent.model.model_faults import first_fault
 
 MAX_BARS = 40
 _NS = 1e-9
@@ -64,9 +65,7 @@ def read_run(folder: Path) -> RunData:
     try:
         read = Result.model_validate_json(result.read_bytes()) if result.is_file() else None
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{result} is no result of a run: {place or 'the file'}: {first['msg']}") from error
+        raise UsageError(f"{result} is no result of a run: {first_fault(error)}") from error
     recording = load_recording(session)
     if read is not None and (strangers := sorted(set(read.serials) - recording.modules.keys())):
         raise UsageError(

@@ -14,6 +14,7 @@ from coordinator.identification.result import ModuleBodyPart, Result
 from coordinator.recording.run_folder import RESULT
 from coordinator.recording.versions import current_run
 from module_agent.model.chain import Array, Chain
+from module_agent.model.model_faults import first_fault
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 
@@ -53,9 +54,7 @@ def read_result(folder: Path) -> Result:
     try:
         return Result.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise BaselineError(f"{path} is no result of a run: {place or 'the file'}: {first['msg']}") from error
+        raise BaselineError(f"{path} is no result of a run: {first_fault(error)}") from error
 
 
 def gravity_model(folder: Path, suspect: bool = False) -> GravityModel:

@@ -27,6 +27,7 @@ from pydantic import ValidationError
 from module_agent.control.gains import for_message, from_message
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
+from module_agent.model.model_faults import first_fault
 from module_agent.wire.messages import GainSet, PidGains
 
 ROOTS = ("group_gains", "gains")
@@ -76,9 +77,7 @@ def read_gains(path: Path, present: Sequence[GainSet]) -> list[GainSet]:
     try:
         return [GainSet.model_validate(own) for own in sets]
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise GainsFileError(f"{path}: {place} = {first['input']}: {first['msg']}") from error
+        raise GainsFileError(f"{path}: {first_fault(error)}") from error
 
 
 def write_gains(path: Path, gains: Sequence[GainSet]) -> None:

@@ -28,7 +28,8 @@ from pydantic import ValidationError
 
 from module_agent.control.safety import UNCONFIGURED, LimitAction, MStopAction, Safety
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import Location, fault_lines, faults_of, parse_toml
+from module_agent.model.model_faults import Location, faults_of
+from module_agent.model.toml_location import fault_lines, parse_toml
 
 _POSITION_ACTIONS: dict[str, LimitAction] = {
     "disabled": "disabled",

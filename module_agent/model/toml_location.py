@@ -8,15 +8,10 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from module_agent.model.errors import UsageError
-
-if TYPE_CHECKING:
-    # Programs read their settings before they know that they need more than their help.
-    from pydantic import ValidationError
-
-Location = tuple[int | str, ...]
+from module_agent.model.model_faults import Location
 
 _HEADER = re.compile(r"\s*(\[\[?)\s*([A-Za-z0-9_.\"-]+)\s*\]\]?")
 _KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
@@ -90,15 +85,6 @@ def _unreadable(table: dict[str, Any]) -> tuple[Location, str] | None:
         )
         waiting += [((*location, key), part) for key, part in parts]
     return None
-
-
-def faults_of(error: "ValidationError") -> list[tuple[Location, str]]:
-    """Return where a document does not fit its model, and why."""
-    plain = {"extra_forbidden": "unknown key", "missing": "is missing"}
-    return [
-        (tuple(e["loc"]), plain.get(e["type"], str(e["msg"]).removeprefix("Value error, ")))
-        for e in error.errors(include_url=False)
-    ]
 
 
 def fault_lines(faults: Iterable[tuple[Location, str]], text: str, name: str | Path) -> str:

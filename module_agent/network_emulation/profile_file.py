@@ -17,7 +17,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import fault_lines, faults_of, read_toml
+from module_agent.model.model_faults import faults_of
+from module_agent.model.toml_location import fault_lines, read_toml
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.trace import TraceError, read_trace
 

@@ -21,7 +21,8 @@ from typing import Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import read_toml
+from module_agent.model.model_faults import faults_of
+from module_agent.model.toml_location import fault_lines, read_toml
 from module_agent.wire.keys import ROOT, Leaf
 from module_agent.wire.topics import PUBLISHED_BY_MODULE, PUBLISHED_TO_MODULE, SERVED
 
@@ -110,12 +111,11 @@ def load_fleet(folder: Path) -> Fleet:
         raise UsageError(
             f"--secure {folder}: no {FLEET} in it; `x5-coordinator keys --out {folder}` makes such a folder"
         )
-    table, _ = read_toml(path)
+    table, text = read_toml(path)
     try:
         return Fleet.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise UsageError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise UsageError(fault_lines(faults_of(error), text, path)) from error
 
 
 def load_credentials(folder: Path, robot: str, names: Sequence[str]) -> Credentials:

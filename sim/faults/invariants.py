@@ -26,8 +26,8 @@ AXIS_DEG = 2.0
 TIP_DEG, TIP_MM = 3.0, 20.0
 # Nothing is claimed of it; an IMU's errors turn it by a degree or two.
 GRAVITY_DEG = 3.0
-# Predicted torques of a held-out motion, of every joint: of 13 sessions without faults they err by 0.017 Nm rms
-# at most. A share of the true ones counts where it is larger.
+# Predicted torques of a held-out motion, of every joint: of 13 sessions without faults they err by 0.017 Nm
+# rms at most. A share of the true ones counts where it is larger.
 TORQUE_NM, TORQUE_SHARE = 0.05, 0.05
 
 # A claim that is wider says little: no error would be beyond it.

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import CATALOGUE
+from module_agent.model.model_faults import faults_of, first_fault
 from sim.geometry.link_parts import BRACKETS, End, FreePose, Part, Tube, placed
 from sim.geometry.pose import Array
 from sim.geometry.rigid_body import RigidBody, joined, moved
@@ -102,8 +103,7 @@ class _Reader:
             base = Base(rpy_deg=(roll, pitch, yaw))
             return Robot.model_validate({"name": name, "base": base, "module": modules})
         except ValidationError as error:
-            first = error.errors()[0]
-            raise self._fail(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+            raise self._fail(first_fault(error)) from error
 
     def _branch(self, parent: Element, at: _Place) -> None:
         """Follow the elements of a branch, and leave what is behind its last module to that module."""
@@ -171,7 +171,7 @@ class _Reader:
         try:
             return Tube(length_m=length, twist_rad=twist, input=_OURS[first], output=_OURS[last])
         except ValidationError as error:
-            raise self._fail(f"<{element.tag}>: {error.errors()[0]['msg']}") from error
+            raise self._fail(f"<{element.tag}>: {faults_of(error)[0][1]}") from error
 
     def _solid(self, element: Element, prefix: str) -> FreePose:
         """Return a rigid body; its output is as attributes with this prefix say, none without."""
@@ -195,7 +195,7 @@ class _Reader:
         try:
             return _free(xyz, rotation, body)
         except ValidationError as error:
-            raise self._fail(error.errors()[0]["msg"]) from error
+            raise self._fail(faults_of(error)[0][1]) from error
 
     # ------------------------------------------------------------------ attributes
 

@@ -14,8 +14,9 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, Va
 
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError, UsageError
+from module_agent.model.model_faults import Location, faults_of
 from module_agent.model.suggestion import did_you_mean
-from module_agent.model.toml_location import Location, fault_lines, faults_of, parse_toml
+from module_agent.model.toml_location import fault_lines, parse_toml
 from module_agent.network_emulation.profile_file import network as network_profile
 from module_agent.network_emulation.profile_file import network_relative_to
 from module_agent.wire.keys import check_chunk

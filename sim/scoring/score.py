@@ -20,6 +20,7 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart, migrate
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.errors import DataError, UsageError
+from module_agent.model.model_faults import first_fault
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import (
     gravity_error_deg,
@@ -283,9 +284,7 @@ def _read_result(path: Path) -> _ResultFile:
             document = migrate(json.loads(path.read_text(encoding="utf-8")))
         result = _ResultFile.model_validate(document)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ScoreError(f"{path}: {where or 'the document'}: {first['msg']}") from error
+        raise ScoreError(f"{path}: {first_fault(error)}") from error
     if result.schema_version != SCHEMA:
         raise ScoreError(f"{path} has schema {result.schema_version}; this program scores schema {SCHEMA}")
     if result.serials != result.chain.serials:

@@ -7,7 +7,8 @@ from typing import Annotated
 from pydantic import Field, ValidationError, model_validator
 
 from module_agent.model.errors import UsageError
-from module_agent.model.toml_location import faults_of, parse_toml
+from module_agent.model.model_faults import faults_of
+from module_agent.model.toml_location import parse_toml
 from sim.geometry.link_parts import Strict, Xyz
 
 _NOTHING = (0.0, 0.0, 0.0)

@@ -73,7 +73,7 @@ def test_a_result_of_another_run_is_refused(folder: Path, result: Result, tmp_pa
     with pytest.raises(UsageError, match=r"has nothing .*-B.*: they are not of one run"):
         read_run(tmp_path)
     (tmp_path / RESULT).write_text("{")
-    with pytest.raises(UsageError, match="is no result of a run: the file: Invalid JSON"):
+    with pytest.raises(UsageError, match="is no result of a run: it is no JSON"):
         read_run(tmp_path)
 
 

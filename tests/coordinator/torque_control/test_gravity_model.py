@@ -98,5 +98,5 @@ def test_a_folder_without_a_result_or_with_another_file_in_its_place_is_refused(
     with pytest.raises(BaselineError, match=r"holds no result.json: give the folder of a run that has"):
         gravity_model(tmp_path)
     (tmp_path / RESULT).write_text("{}")
-    with pytest.raises(BaselineError, match=r"result.json is no result of a run: robot: Field required"):
+    with pytest.raises(BaselineError, match=r"result.json is no result of a run: robot: is missing"):
         gravity_model(tmp_path)

@@ -173,7 +173,10 @@ def test_a_gain_that_is_no_limit_cannot_be_infinite(file: Path) -> None:
         ("<group_gains><position><kp>nan</kp></position></group_gains>", "'nan' is no number"),
         ("<group_gains><torque/></group_gains>", "unknown element <torque>"),
         ("<group_gains><control_strategy>5</control_strategy></group_gains>", "control strategy '5'"),
-        ("<group_gains><effort><i_clamp>-1</i_clamp></effort></group_gains>", "effort.i_clamp = -1.0"),
+        (
+            "<group_gains><effort><i_clamp>-1</i_clamp></effort></group_gains>",
+            "effort.i_clamp: expected at least 0, found -1.0",
+        ),
         ("<robot/>", "its root is <robot>"),
         (
             '<!DOCTYPE gains [<!ENTITY k "1">]><gains><position><kp>&k;</kp></position></gains>',

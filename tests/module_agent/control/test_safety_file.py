@@ -70,7 +70,7 @@ at_limit = ["disabled", "spring"]
     [
         ("[default]\nspeed = 1.0\n", 2, ("default.speed", "unknown key")),
         ("[default]\nvelocity_rad_s = true\n", 2, ("default.velocity_rad_s",)),
-        ("[default]\ncurrent_a = -1.0\n", 2, ("default.current_a", "greater than 0")),
+        ("[default]\ncurrent_a = -1.0\n", 2, ("default.current_a", "more than 0")),
         ("[default]\ncurrent_a = nan\n", 2, ("default.current_a",)),
         ("[default]\nwinding_c = 300.0\n", 2, ("default.winding_c", "154")),
         ("[default]\nwinding_c = '90'\n", 2, ("default.winding_c",)),

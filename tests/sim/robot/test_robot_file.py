@@ -107,7 +107,7 @@ def test_an_unknown_robot_is_answered_with_the_shipped_ones() -> None:
         ('parent = "base"', 'parent = "two"', 10, "one -> two -> one"),
         ('parent = "one"', "", 12, "module[1].parent: is missing"),
         ("HeavyRightOutside", "HeavyMiddle", 17, "unknown bracket 'HeavyMiddle'"),
-        ("length_m = 0.3", "length_m = -0.3", 18, "greater than 0"),
+        ("length_m = 0.3", "length_m = -0.3", 18, "more than 0"),
         ("length_m = 0.3", "length_m = nan", 18, "finite"),
         ("length_m = 0.3", "lenght_m = 0.3", 18, "lenght_m: unknown key"),
         ('{ bracket = "HeavyRightOutside" }', "{ }", 16, "exactly one of: tube, bracket, pose"),

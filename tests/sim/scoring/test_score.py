@@ -290,7 +290,7 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str) -> None:
 def test_what_is_wrong_within_a_file_is_named(tmp_path: Path) -> None:
     cases: list[tuple[dict[str, Any], str]] = [
         ({"schema": 3}, "schema 3; this program scores schema 2"),
-        ({"robot_time_s": "long"}, "robot_time_s: Input should be a valid number"),
+        ({"robot_time_s": "long"}, "robot_time_s: expected a number, found 'long'"),
         ({"null_basis": [[1.0]]}, "null_basis must have 36 rows"),
         ({"serials": ["root"]}, r"serials and chain\.serials differ"),
         (

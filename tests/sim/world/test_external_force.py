@@ -139,7 +139,7 @@ def test_a_push_is_read_from_one_line_with_or_without_quotation_marks() -> None:
     [
         ("serial=A,force_n=[0,0,1]", "for_s: is missing"),
         ("serial=A,for_s=1", "nothing pushes: give force_n, torque_nm or both"),
-        ("serial=A,force_n=[0,0,nan],for_s=1", "force_n: Input should be a finite number"),
+        ("serial=A,force_n=[0,0,nan],for_s=1", "force_n: expected a finite number, found nan"),
         ("serial=A,force_n=[0,0,1],for_s=1,colour=1", "colour: unknown key"),
         ("hard", "is no push"),
     ],
