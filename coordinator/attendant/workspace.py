@@ -23,7 +23,7 @@ from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import UsageError
 from module_agent.model.forward_kinematics import body_displacements
-from module_agent.model.model_faults import faults_of
+from module_agent.model.model_faults import faults_of, first_fault
 from module_agent.model.toml_location import fault_lines, read_toml
 from module_agent.wire.messages import ConstantMotion, GoTo, Pattern
 
@@ -88,7 +88,7 @@ class Workspace(_Table):
         """Return a plan whose motions about home have the room that the joints have; it begins slowly.
 
         Raises:
-            UsageError: a joint has too little room about home.
+            UsageError: a joint has too little room about home, for this plan or for any.
         """
         home, room = plan.home_rad, np.inf
         for serial in serials:
@@ -106,7 +106,12 @@ class Workspace(_Table):
             "excitation_reach_rad": min(plan.excitation_reach_rad, room),
             "trial_speed_rad_s": self.trial_speed_rad_s,
         }
-        return Plan.model_validate({**plan.model_dump(), **changed})
+        try:
+            return Plan.model_validate({**plan.model_dump(), **changed})
+        except ValidationError as error:
+            raise UsageError(
+                f"no plan fits into the workspace, {room:g} rad to either side of home: {first_fault(error)}"
+            ) from error
 
 
 def load_workspace(path: Path) -> Workspace:

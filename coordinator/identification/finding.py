@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+from coordinator.recording.journal import Purpose
 from module_agent.model.errors import EXIT_SUSPECT, DataError
 
 # The sensor and what is wrong with it, for programs; sentences are for people.
@@ -45,6 +46,11 @@ UNUSABLE: frozenset[Sickness] = frozenset(
         "messages_missing",
     }
 )
+
+
+def motion_of(purpose: Purpose) -> str:
+    """Return what a finding calls a joint's own motion of a purpose."""
+    return f"its {purpose} motion"
 
 
 class Finding(NamedTuple):

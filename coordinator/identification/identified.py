@@ -7,7 +7,7 @@ import numpy as np
 from coordinator.batch_estimation.estimator import Refinement
 from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.dynamics.torque_prediction import TorqueError
-from coordinator.identification.finding import UNUSABLE, Finding, SensorError
+from coordinator.identification.finding import UNUSABLE, Finding, SensorError, motion_of
 from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import Result
@@ -18,6 +18,8 @@ from coordinator.topology.topology import Topology
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
+
+HELD_OUT = motion_of("held_out")
 
 
 class IdentificationError(DataError):
@@ -61,8 +63,18 @@ class Kinematics(NamedTuple):
     @property
     def dynamic(self) -> bool:
         """Whether torques tell of all bodies: every joint is known and moved, every effort is measured."""
-        sick = UNUSABLE | {"effort_stuck"}
-        return not self.missing and not any(one.serious and one.kind in sick for one in self.findings)
+        return not self.missing and all(one.motion == HELD_OUT for one in self._without_torques)
+
+    @property
+    def checkable(self) -> bool:
+        """Whether the torques of a held-out motion tell how good inertia is."""
+        return self.dynamic and not self._without_torques
+
+    @property
+    def _without_torques(self) -> list[Finding]:
+        """The findings on joints of whose torques or motions nothing is known."""
+        sick = UNUSABLE | {"effort_stuck", "joint_halted"}
+        return [one for one in self.findings if one.serious and one.kind in sick]
 
     @property
     def suspicions(self) -> list[str]:

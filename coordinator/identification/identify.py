@@ -124,7 +124,7 @@ def identify(
         bodies = robot_bodies(
             estimate.information, chain, types, estimate.fit, INDEPENDENT_FRACTION, inertia.effects
         )
-        if recording.latest_motions("held_out"):
+        if recording.latest_motions("held_out") and kinematics.checkable:
             means = joined_motions([without_terms(one, estimate) for one in windows]).tau_nm.mean(axis=0)
             windows = dynamic_windows(recording, clocks, serials, "held_out")
             motion = joined_motions([without_terms(one, estimate) for one in windows])

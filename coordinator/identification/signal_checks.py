@@ -10,10 +10,11 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from coordinator.identification.finding import UNUSABLE, Finding, Sickness
+from coordinator.identification.finding import UNUSABLE, Finding, Sickness, motion_of
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import ModuleRecord, Recording, RoundTrip
 from module_agent.model.catalogue import GRAVITY_M_S2
@@ -36,10 +37,11 @@ CLIPPED_SAMPLES, CLIPPED_SIGMAS = 8, 30.0
 CUT_OFF = 5.0
 # A joint turns by this much while its encoder or effort is said to be stuck.
 TURNED_RAD = 0.05
-# A joint that turned by less than this share of its command was held, or its motor failed meanwhile: of all
-# of a motion, and of what is commanded within so long, if that is as much.
+# A joint that turned by less than this share of its command was held, or its motor failed meanwhile.
 MIN_FOLLOWED = 0.2
-HALTED_S, HALTED_RAD = 0.5, 0.1
+# It halted where that is so for this long while it was to turn by so much: what lasts for 0.75 s is found,
+# wherever it begins. A joint follows its command more closely than the last.
+HALTED_S, HALTED_RAD, FOLLOWED_RAD = 0.5, 0.1, 0.02
 # A position that changes by this much from one sample to the next, and neither before nor after it.
 JUMP_RAD = 0.02
 # Clocks of crystals, and some more; the least leap; steps between rows of this many usual ones are long.
@@ -95,14 +97,16 @@ def sensor_findings(recording: Recording, serials: Sequence[str]) -> tuple[Findi
     heard = [s for s in serials if s not in silent]
     rows = {s: _all_rows(recording.modules[s]) for s in heard}
     beside = {s: _all_rows(module) for s, module in recording.modules.items() if s not in serials}
-    later = recording.motions("dynamic", "held_out")
+    whole = recording.latest_motions("whole", "repeat")
+    # Steps that were done again count as they were done last.
+    later = {(e.step, e.serial): e for e in recording.motions("dynamic", "held_out")}.values()
     events = [*recording.latest_motions("constant", "windowed_sine", "whole"), *later]
     return (
         *(_silent(s) for s in silent),
         *_inertial(rows, {s: recording.rest_rows(s) for s in heard}),
         *(one for s in heard for one in _gravity(s, recording.rest_rows(s)["accel_m_s2"].astype(float))),
         *(one for s in heard for one in _joint(s, [e for e in events if e.serial == s], recording)),
-        *(one for s in heard for one in _halted(s, [e for e in later if e.serial == s], recording)),
+        *(one for s in heard for one in _halts(s, [e for e in (*whole, *later) if e.serial == s], recording)),
         *(one for s, own in (rows | beside).items() for one in _jumps(s, own)),
         *_clocks(recording, rows),
         *_not_finite(recording, serials),
@@ -263,7 +267,7 @@ def _joint(serial: str, events: Sequence[JournalEvent], recording: Recording) ->
                 found.add(kind)
                 yield Finding(
                     serial,
-                    f"its {event.purpose} motion",
+                    motion_of(event.purpose),
                     f"the time for which {name} reads exactly the same while the joint turns",
                     stuck[0].length * step_s,
                     step_s,
@@ -275,47 +279,57 @@ def _joint(serial: str, events: Sequence[JournalEvent], recording: Recording) ->
                 )
 
 
-def _halted(serial: str, events: Sequence[JournalEvent], recording: Recording) -> Iterable[Finding]:
-    """Yield a joint that stood in a motion for inertia or of the check, where it did so most clearly.
+def _halts(serial: str, events: Sequence[JournalEvent], recording: Recording) -> Iterable[Finding]:
+    """Yield a joint that stood while its motion commanded it to turn, in the first motion in which it did.
 
-    What it carries shows in its own torques only as far as it moves.
+    Constant and windowed sine motions are looked at as a whole, by the search for the topology.
     """
-    worst: Finding | None = None
+    gear_ratio = recording.module_type(serial).gear_ratio if recording.modules[serial].info else np.inf
     for event in events:
         if event.motion is None or event.motion.end_row is None:
             continue
         rows = recording.rows(serial, event.motion.start_row, event.motion.end_row)
-        for turned_rad, wanted_rad in _spans(rows):
-            if turned_rad >= MIN_FOLLOWED * wanted_rad or wanted_rad < HALTED_RAD:
-                continue
-            if worst is None or wanted_rad - turned_rad > worst.expected - worst.measured:
-                worst = Finding(
-                    serial,
-                    f"its {event.purpose} motion",
-                    f"the way that it turned within {HALTED_S:g} s",
-                    turned_rad,
-                    wanted_rad,
-                    (wanted_rad - turned_rad) / JUMP_RAD,
-                    "rad",
-                    "its motor is dead, or something held the joint",
-                    "joint_halted",
-                    True,
-                )
-    if worst is not None:
-        yield worst
+        worst = _worst_halt(rows, gear_ratio)
+        if worst is not None:
+            turned_rad, wanted_rad = worst
+            yield Finding(
+                serial,
+                motion_of(event.purpose),
+                f"the range of its position within {HALTED_S:g} s",
+                turned_rad,
+                wanted_rad,
+                (wanted_rad - turned_rad) / FOLLOWED_RAD,
+                "rad",
+                "its motor is dead, or something held the joint",
+                "joint_halted",
+                True,
+            )
+            return
 
 
-def _spans(rows: Rows) -> list[tuple[float, float]]:
-    """Return the ranges of position and of its command [rad] in each `HALTED_S` of rows without a hole."""
-    samples = round(HALTED_S / step_s) if (step_s := _step_s(rows["t_ns"].astype(np.int64))) else 0
-    if samples < 2 or len(rows) < samples:
-        return []
-    whole = len(rows) - len(rows) % samples
-    columns = [
-        rows[n][:whole].astype(float).reshape(-1, samples) for n in ("position_rad", "position_command_rad")
-    ]
-    spans = np.stack([np.ptp(column, axis=1) for column in columns], axis=1)
-    return [(turned, wanted) for turned, wanted in spans[np.isfinite(spans).all(axis=1)].tolist()]
+def _worst_halt(rows: Rows, gear_ratio: float) -> tuple[float, float] | None:
+    """Return by how much a joint turned, and was to turn [rad], in the `HALTED_S` in which it halted most.
+
+    None if it never did. Where its motor turned, its encoder is sick, and it did not halt. What has no
+    command, or rows with holes, tells nothing.
+    """
+    t_ns = rows["t_ns"].astype(np.int64)
+    step_s = _step_s(t_ns)
+    samples = round(HALTED_S / step_s) if step_s > 0.0 else 0
+    if samples < 4 or len(rows) < samples:
+        return None
+    starts = np.unique([*range(0, len(rows) - samples, samples // 2), len(rows) - samples])
+    motor = np.cumsum(np.nan_to_num(rows["motor_velocity_rad_s"].astype(float))) * step_s / gear_ratio
+    columns = rows["position_rad"].astype(float), rows["position_command_rad"].astype(float), motor, t_ns
+    turned, wanted, by_motor, lasted_ns = (
+        np.ptp(sliding_window_view(column, samples)[starts], axis=1) for column in columns
+    )
+    halted = (wanted >= HALTED_RAD) & (np.maximum(turned, by_motor) < MIN_FOLLOWED * wanted)
+    halted &= lasted_ns < 1.5 * HALTED_S * NS_PER_S
+    if not halted.any():
+        return None
+    worst = int(np.where(halted, wanted - turned, -np.inf).argmax())
+    return float(turned[worst]), float(wanted[worst])
 
 
 def _jumps(serial: str, rows: Rows) -> Iterable[Finding]:

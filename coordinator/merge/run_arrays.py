@@ -81,7 +81,9 @@ def read_unversioned(
         raise RunArraysError(f"{path} is not {what}: {error}{again}") from error
     try:
         return read(arrays)
-    except (KeyError, ValueError, DataError) as error:
+    except KeyError as error:
+        raise RunArraysError(f"{path} is not {what}: it has no {error}{again}") from error
+    except (ValueError, DataError) as error:
         raise RunArraysError(f"{path} is not {what}: {error}{again}") from error
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgpack
 from pydantic import ValidationError
 
-from module_agent.model.model_faults import described
+from module_agent.model.model_faults import described, details
 from module_agent.wire.messages import (
     COMMANDS,
     MAX_BATCH_ROWS,
@@ -82,10 +82,9 @@ def _unpack(data: bytes, max_bytes: int, may_prove: bool) -> dict[str, Any]:
 
 def _reason(error: ValidationError) -> WireError:
     """Pick the error that comes first in the order types, finiteness, range."""
-    # An array whose elements are wrong counts as too short as well: the elements say why.
-    order = {"finite_number": 1, **dict.fromkeys(_RANGE_ERRORS, 2), "too_short": 3}
-    first = min(error.errors(include_url=False), key=lambda item: order.get(item["type"], 0))
-    reason = (Refusal.TYPES, Refusal.NOT_FINITE, Refusal.RANGE, Refusal.TYPES)[order.get(first["type"], 0)]
+    order = {"finite_number": 1, **dict.fromkeys(_RANGE_ERRORS, 2)}
+    first = min(details(error), key=lambda item: order.get(item["type"], 0))
+    reason = (Refusal.TYPES, Refusal.NOT_FINITE, Refusal.RANGE)[order.get(first["type"], 0)]
     return WireError(reason, described(first)[:480])
 
 

@@ -13,6 +13,7 @@ from coordinator.recording.journal import refused_by_limits
 from coordinator.recording.run_folder import RESULT, SESSION, load_recording
 from coordinator.recording.session_file import MCAP0_MAGIC
 from module_agent.model.errors import RobotError
+from module_agent.model.model_faults import first_fault
 from sim.faults.run import WITH_RESULT, Ending
 from sim.faults.schedule import Schedule
 from sim.scoring.score import LinkScore, Score, score
@@ -21,7 +22,7 @@ from sim.scoring.score import LinkScore, Score, score
 SIGMAS = 5.0
 RESOLUTION_MM = 2.0
 # So are those of axes and tips, or what short motions tell: of 95 sessions with the right robot axes err by
-# half a degree at most, tips by 0.6 degrees and 7 mm. A jump of an encoder by a degree is found by itself.
+# half a degree at most, tips by 0.6 degrees and 7 mm. A jump of an encoder by 1.2 degrees is found by itself.
 AXIS_DEG = 2.0
 TIP_DEG, TIP_MM = 3.0, 20.0
 # Nothing is claimed of it; an IMU's errors turn it by a degree or two.
@@ -79,10 +80,10 @@ class _Wrong(NamedTuple):
     modules: frozenset[str] = frozenset()
 
 
-def check_folder(out: Path, ending: Ending, untimed: frozenset[str] = frozenset()) -> FolderCheck:
+def check_folder(out: Path, ending: Ending, clock_sick: frozenset[str] = frozenset()) -> FolderCheck:
     """Return the violations of a session: of its recording, its result, and its time; and what it claims.
 
-    untimed: modules whose predicted torques are not compared with the truth, as their clocks are sick.
+    clock_sick: modules whose predicted torques are not compared with the truth, as their clocks are sick.
     """
     violations: dict[str, str] = {}
     if ending.name == "unbounded":
@@ -108,16 +109,15 @@ def check_folder(out: Path, ending: Ending, untimed: frozenset[str] = frozenset(
         unmoved = set() if recording is None else refused_by_limits(recording.journal)
         scored = score(out)
     except (OSError, ValidationError, RobotError) as error:
-        return FolderCheck(violations | {"unreadable result": str(error)})
+        text = first_fault(error) if isinstance(error, ValidationError) else str(error)
+        return FolderCheck(violations | {"unreadable result": text})
     if ending.name == "result":
-        wrong = _wrong(scored, ending.unheard, unmoved, believed=True)
-        if not wrong.text:
-            wrong = _wrong_torque(scored, untimed)
+        wrong = _wrong(scored, ending.unheard, unmoved, clock_sick, believed=True)
         violations |= {"wrong robot": wrong.text} if wrong.text else {}
         return FolderCheck(violations, _widest(scored, ending.unheard, unmoved))
     # Modules that it says it is without are no errors of the rest.
     without = {s for s in _serials(scored) - set(result.serials) if _has_serial(ending.text, s)}
-    wrong = _wrong(scored, ending.unheard | without, unmoved, believed=False)
+    wrong = _wrong(scored, ending.unheard | without, unmoved, clock_sick, believed=False)
     near = wrong.modules or _serials(scored)
     is_explained = any(_has_serial(ending.text, serial) for serial in near)
     return FolderCheck(violations, wrong=wrong.text, is_explained=is_explained)
@@ -168,13 +168,19 @@ def is_misnamed(schedule: Schedule, ending: Ending) -> bool:
     return bool(accused) and not accused & sick and "expected, found" not in ending.text
 
 
-def _wrong(scored: Score, unheard: frozenset[str] | set[str], unmoved: set[str], believed: bool) -> _Wrong:
+def _wrong(
+    scored: Score,
+    unheard: frozenset[str] | set[str],
+    unmoved: set[str],
+    clock_sick: frozenset[str],
+    believed: bool,
+) -> _Wrong:
     """Say what is wrong with the result, but for what nothing could show.
 
     unheard: modules that do not exist for the coordinator, whose neighbours are mounted on each other for it.
     unmoved: modules that refused to turn their joint by their own limits: how they are mounted, and what they
-    carry, is not known. believed: whether its exit code says that it is right: then something is claimed of
-    every link.
+    carry, is not known. clock_sick: see `check_folder`. believed: whether its exit code says that it is
+    right: then something is claimed of every link.
     """
     carried = {link.child for link in scored.links if link.parent in unheard | unmoved}
     unknown = (
@@ -192,7 +198,10 @@ def _wrong(scored: Score, unheard: frozenset[str] | set[str], unmoved: set[str],
         if wrong:
             modules = frozenset((link.parent, link.child))
             return _Wrong(f"link {link.parent} - {link.child} {wrong}", modules)
-    return _Wrong("" if unheard | unmoved else _wrong_robot(scored))
+    if unheard | unmoved:
+        return _Wrong("")
+    whole = _wrong_robot(scored)
+    return _Wrong(whole) if whole else _wrong_torque(scored, clock_sick)
 
 
 def _wrong_link(link: LinkScore) -> str:
@@ -224,12 +233,12 @@ def _wrong_robot(scored: Score) -> str:
     )
 
 
-def _wrong_torque(scored: Score, untimed: frozenset[str]) -> _Wrong:
+def _wrong_torque(scored: Score, clock_sick: frozenset[str]) -> _Wrong:
     """Say which joint's torques are predicted wrongly, in a motion that inertia was not identified from."""
     size_nm = scored.torque_rms_nm_per_joint or {}
     for serial, error_nm in (scored.torque_rms_error_nm_per_joint or {}).items():
         most_nm = max(TORQUE_NM, TORQUE_SHARE * size_nm[serial])
-        if serial not in untimed and not error_nm <= most_nm:
+        if serial not in clock_sick and not error_nm <= most_nm:
             text = f"torques of {serial} are predicted {error_nm:.3f} Nm off, expected at most {most_nm:.3f}"
             return _Wrong(text, frozenset((serial,)))
     return _Wrong("")

@@ -228,7 +228,7 @@ class PlantWitness:
             first_look = -(first_ns // TICK_NS) % SPEED_TICKS
             if first_look < len(seen):
                 looked_ns = first_ns + first_look * TICK_NS
-                self._check_speeds(robot, looked_ns, seen[first_look::SPEED_TICKS, PLANT_MOTOR_RAD_S])
+                self._check_speeds(robot, looked_ns, seen[first_look::SPEED_TICKS])
             self._check_positions(robot.serials, first_ns, seen)
         elif any(self._outward_rad.values()):
             self._outward_rad = dict.fromkeys(self._ranges, 0.0)
@@ -274,9 +274,10 @@ class PlantWitness:
         )
         self._note("PWM out of range", text)
 
-    def _check_speeds(self, robot: VirtualRobot, first_ns: int, speeds: Array) -> None:
-        limits = self._max_speeds(robot)
-        within = np.abs(speeds) <= SPEED_MARGIN * limits
+    def _check_speeds(self, robot: VirtualRobot, first_ns: int, seen: Array) -> None:
+        """Judge motors that are driven on, (T, rows, n): a load may turn one that is off, or brakes."""
+        limits, speeds = self._max_speeds(robot), seen[:, PLANT_MOTOR_RAD_S]
+        within = (np.abs(speeds) <= SPEED_MARGIN * limits) | (speeds * seen[:, PLANT_PWM] <= 0.0)
         if within.all():
             return
         tick, k = np.argwhere(~within)[0].tolist()

@@ -142,7 +142,7 @@ def _judged(schedule: Schedule) -> SeedReport:
             violations["traceback"] = _described(error)
         if logged:
             violations.setdefault("traceback", f"logged: {_described(logged[0])}")
-        checked = check_folder(Path(folder) / "run", ending, schedule.untimed)
+        checked = check_folder(Path(folder) / "run", ending, schedule.clock_sick)
         violations |= witness.violations | checked.violations
     begun = tuple(fault for fault in schedule.faults if fault.begins_s <= ending.at_s)
     # What was still to come has done nothing.

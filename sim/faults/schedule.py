@@ -74,7 +74,7 @@ class Schedule(NamedTuple):
         return PLANS[self.planned]
 
     @property
-    def untimed(self) -> frozenset[str]:
+    def clock_sick(self) -> frozenset[str]:
         """The modules whose clock is sick: when the truth was at an instant of theirs is not known."""
         serials = self.robot.serials
         return frozenset(serials[f.module] for f in self.faults if f.nature.part == "clock")
@@ -146,7 +146,7 @@ def first_modules(robot: Robot, modules: int) -> Robot:
 
 
 def simpler(schedule: Schedule) -> Iterator[Schedule]:
-    """Yield what is simpler by one step: fewer faults or modules, a perfect network, shorter ones."""
+    """Yield what is simpler by one step: fewer faults, modules or plans, no delays, shorter faults."""
     faults = schedule.faults
     if len(faults) > 1:
         for k in range(len(faults)):

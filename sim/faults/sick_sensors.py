@@ -16,7 +16,7 @@ _POSITION, _VELOCITY, _EFFORT = (
     _FIELDS.index(f"{name}") for name in ("position_rad", "velocity_rad_s", "effort_nm")
 )
 _IMU = slice(_FIELDS.index("gyro_x_rad_s"), _FIELDS.index("accel_z_m_s2") + 1)
-# Largest sizes: jumps of clock and encoder, and a drift; what is smallest is a tenth of it.
+# Largest sizes: jumps of clock and encoder, and a drift; what is smallest is a hundredth of it.
 JUMP_S, JUMP_RAD, DRIFT = 2.0, 1.0, 4e-3
 # Ends of the range that a saturated gyro or accelerometer is stuck at [rad/s, m/s^2].
 FULL_SCALE = (34.9, 156.9)

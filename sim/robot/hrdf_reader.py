@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import CATALOGUE
-from module_agent.model.model_faults import faults_of, first_fault
+from module_agent.model.model_faults import first_fault
 from sim.geometry.link_parts import BRACKETS, End, FreePose, Part, Tube, placed
 from sim.geometry.pose import Array
 from sim.geometry.rigid_body import RigidBody, joined, moved
@@ -93,6 +93,8 @@ class _Reader:
             raise self._fail(f"its root is <{root.tag}>, that of HRDF is <robot>")
         self._check(root)
         self._branch(root, _Place(BASE, ()))
+        if not self._modules:
+            raise self._fail("it has no actuator")
         roll, pitch, yaw = Rotation.from_matrix(self._rotation(root, "rot")).as_euler("xyz", degrees=True)
         try:
             modules = [
@@ -171,7 +173,7 @@ class _Reader:
         try:
             return Tube(length_m=length, twist_rad=twist, input=_OURS[first], output=_OURS[last])
         except ValidationError as error:
-            raise self._fail(f"<{element.tag}>: {faults_of(error)[0][1]}") from error
+            raise self._fail(f"<{element.tag}>: {first_fault(error)}") from error
 
     def _solid(self, element: Element, prefix: str) -> FreePose:
         """Return a rigid body; its output is as attributes with this prefix say, none without."""
@@ -195,7 +197,7 @@ class _Reader:
         try:
             return _free(xyz, rotation, body)
         except ValidationError as error:
-            raise self._fail(faults_of(error)[0][1]) from error
+            raise self._fail(first_fault(error)) from error
 
     # ------------------------------------------------------------------ attributes
 

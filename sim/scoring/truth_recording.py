@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from coordinator.identification.result import Result
 from coordinator.kinematics.null_space import name_null_space
@@ -19,6 +20,7 @@ from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from coordinator.viewer.viewer_process import merge_into
 from module_agent.model.errors import DataError, RobotError
+from module_agent.model.model_faults import first_fault
 from sim.geometry.pose import Array
 from sim.scoring.truth_view import TruthView
 from sim.world.truth import Motion, read_motion, read_truth
@@ -46,9 +48,18 @@ def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None
         drawn.close()
         merge_into(run / VIEW, run / ADDITION)
     except (RobotError, OSError, ValueError, KeyError) as failure:
-        say(f"the true robot is not in {run / VIEW}: {failure}")
+        say(f"the true robot is not in {run / VIEW}: {_why(failure)}")
     finally:
         (run / ADDITION).unlink(missing_ok=True)
+
+
+def _why(failure: Exception) -> str:
+    """Return why a file cannot be read, as a phrase."""
+    if isinstance(failure, ValidationError):
+        return f"{RESULT} is no result of a run: {first_fault(failure)}"
+    if isinstance(failure, KeyError):
+        return f"the truth has no {str(failure.args[0]).split()[0]}"
+    return str(failure)
 
 
 def _shown(recording: Recording, motion: Motion) -> tuple[NDArray[np.int64], Array]:

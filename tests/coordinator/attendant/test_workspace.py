@@ -136,6 +136,8 @@ def test_a_plan_keeps_to_the_room_of_the_joints_and_begins_slowly() -> None:
     gate(elbow=(-0.4, 0.6)).admit({ELBOW: plan.constant()}, {**HOME, ELBOW: -half_way})
     with pytest.raises(UsageError, match="elbow"):
         Workspace(box=WIDE, joints={"all": (-1.2, 1.2), ELBOW: (-0.1, 0.6)}).plan(Plan(), ARM.serials)
+    with pytest.raises(UsageError, match=r"0\.4 rad to either side of home: constant_duration_s: exp"):
+        room.plan(Plan(constant_velocity_rad_s=6.0), ARM.serials)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +149,10 @@ def test_a_plan_keeps_to_the_room_of_the_joints_and_begins_slowly() -> None:
         ("[box]\nlow_m = [0, 0, 0]\nhigh_m = [1, 0, 1]\n[joints]\nall = [-1, 1]", "below"),
         ("[box]\nlow_m = [0, 0, 0]\nhigh_m = [1, 1, 1]\n[joints]\nall = [1, -1]", "joints.all"),
         ("[box]\nlow_m = [0, 0, 0]\nhigh_m = [1, 1, nan]\n[joints]\nall = [-1, 1]", "high_m"),
-        ("hurry = 1\n[box]\nlow_m = [0, 0, 0]\nhigh_m = [1, 1, 1]\n[joints]\nall = [-1, 1]", "hurry"),
+        (
+            "hurry = 1\n[box]\nlow_m = [0, 0, 0]\nhigh_m = [1, 1, 1]\n[joints]\nall = [-1, 1]",
+            r"room.toml:1: hurry: unknown key",
+        ),
     ],
 )
 def test_a_file_that_is_no_workspace_is_refused_with_its_key(tmp_path: Path, text: str, words: str) -> None:

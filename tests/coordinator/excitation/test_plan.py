@@ -1,14 +1,18 @@
 """The motions of a plan are the thesis', within the limits of every module type."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from coordinator.excitation.plan import Plan
+from coordinator.excitation.plan import Plan, load_plan
 from module_agent.control.gains import catalogue_limits, default_gains
 from module_agent.control.motion import Motion, check_motion
 from module_agent.control.waveform import duration_s
 from module_agent.model.catalogue import CATALOGUE, ModuleType
+from module_agent.model.errors import UsageError
 
 TYPES = list(CATALOGUE.values())
 TICK_NS = 1_000_000
@@ -77,6 +81,23 @@ def test_exploring_gains_stiffen_the_position_loop_alone() -> None:
 def test_impossible_plans_are_refused_by_field(field: str, value: float) -> None:
     with pytest.raises(ValidationError, match=field):
         Plan.model_validate({field: value})
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("colour = 1", "plan.toml:2: colour: unknown setting; known are mode, motions, "),
+        ("retries = 6", "plan.toml:2: retries: expected at most 5, found 6"),
+        ("mode = 'half'", "plan.toml:2: mode: expected 'joint' or 'simultaneous', found 'half'"),
+    ],
+)
+def test_a_file_that_is_no_plan_is_refused_with_line_and_setting(
+    tmp_path: Path, line: str, words: str
+) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text(f"rest_s = 1.0\n{line}\n")
+    with pytest.raises(UsageError, match=re.escape(words)):
+        load_plan(path)
 
 
 @pytest.mark.parametrize(("field", "value"), [("mode", "half"), ("motions", "best"), ("precision_mm", 0.0)])

@@ -10,6 +10,7 @@ from coordinator.identification.signal_checks import (
     _early_after,
     _inertial,
     _jumps,
+    _worst_halt,
     chance_repeats,
     runs,
     sample_noise,
@@ -142,3 +143,66 @@ def test_runs_are_the_stretches_of_equal_values() -> None:
     found = runs(np.array([1.0, 1.0, 2.0, 3.0, 3.0, 3.0]), 2)
     assert [(one.start, one.end) for one in found] == [(0, 2), (3, 6)]
     assert found[1].length == 3
+
+
+GEAR = 272.22
+
+
+def followed(
+    halts_s: tuple[float, float] | None = None,
+    amplitude_rad: float = 0.25,
+    lag_s: float = 0.05,
+    for_s: float = 3.2,
+) -> Rows:
+    """A joint at 250 Hz that follows a swing of 1 Hz, and is held from one time to another."""
+    made = np.zeros(round(250 * for_s), ROW)
+    t_s = 4e-3 * np.arange(len(made))
+    made["t_ns"] = TICK_NS * np.arange(len(made))
+    made["position_command_rad"] = amplitude_rad * np.sin(2.0 * np.pi * t_s)
+    at_s = t_s - lag_s
+    if halts_s is not None:
+        at_s = np.where((halts_s[0] <= t_s) & (t_s < halts_s[1]), halts_s[0] - lag_s, at_s)
+    made["position_rad"] = amplitude_rad * np.sin(2.0 * np.pi * at_s)
+    made["motor_velocity_rad_s"] = GEAR * np.gradient(made["position_rad"], 4e-3)
+    return made
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 0.26, 0.4, 1.05, 1.7, 2.4])
+def test_a_joint_that_stands_for_three_quarters_of_a_second_has_halted(begin_s: float) -> None:
+    found = _worst_halt(followed((begin_s, begin_s + 0.8)), GEAR)
+    assert found is not None
+    assert found[0] < 0.05
+    assert found[1] > 0.2
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        followed(),
+        # A slow loop, which is a quarter of a period late; and a motion that is hardly one.
+        followed(lag_s=0.25),
+        followed((0.5, 2.5), amplitude_rad=0.04),
+        followed(for_s=0.3),
+        followed()[:0],
+    ],
+    ids=["well", "late", "small", "short", "empty"],
+)
+def test_a_joint_that_follows_its_command_has_not_halted(rows: Rows) -> None:
+    assert _worst_halt(rows, GEAR) is None
+
+
+def test_a_joint_whose_motor_turns_has_a_sick_encoder_and_did_not_halt() -> None:
+    rows = followed((0.5, 2.5))
+    rows["motor_velocity_rad_s"] = GEAR * np.gradient(rows["position_command_rad"], 4e-3)
+    assert _worst_halt(rows, GEAR) is None
+
+
+def test_without_a_command_or_with_a_hole_in_its_rows_a_joint_is_not_said_to_halt() -> None:
+    rows = followed((0.5, 2.5))
+    rows["position_command_rad"] = np.nan
+    assert _worst_halt(rows, GEAR) is None
+    # Nine rows in ten are gone while it stood.
+    held = followed((0.5, 2.5))
+    kept = np.r_[0:120, 130:620:10, 630:800]
+    assert _worst_halt(held, GEAR) is not None
+    assert _worst_halt(held[kept], GEAR) is None

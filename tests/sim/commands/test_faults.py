@@ -35,7 +35,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(report, "run_schedule", run_schedule)
     monkeypatch.setattr(
-        report, "check_folder", lambda out, ending, untimed: FolderCheck({}, Claim("A - B", 1.5, 0.3))
+        report, "check_folder", lambda out, ending, clock_sick: FolderCheck({}, Claim("A - B", 1.5, 0.3))
     )
     monkeypatch.setattr(faults, "run_trials", one_after_another)
 
@@ -131,7 +131,7 @@ def test_results_that_are_not_plainly_right_have_columns_of_their_own(
 ) -> None:
     document = tmp_path / "faults.json"
     monkeypatch.setattr(report, "run_schedule", lambda *of: Ending(name, "C: its gyro", 60.0))
-    monkeypatch.setattr(report, "check_folder", lambda out, ending, untimed: checked)
+    monkeypatch.setattr(report, "check_folder", lambda out, ending, clock_sick: checked)
     options = ["faults", "--seeds", "7..7", "--no-shrink"]
     found = CliRunner().invoke(app, options)
     assert found.exit_code == (EXIT_FINDING if outcome == "violation" else 0)

@@ -61,19 +61,31 @@ def test_a_joint_that_moves_slowly_and_is_held_in_its_sine_makes_the_result_susp
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("motor stall", "the way that it turned within 0.5 s is"),
+        ("motor stall", "the range of its position within 0.5 s is"),
         ("torque stuck", "its effort reads exactly the same"),
     ],
 )
 def test_what_is_sick_only_in_the_held_out_motion_makes_the_result_suspect(
     kind: str, words: str, tmp_path: Path
 ) -> None:
-    """Inertia is identified by then, and would be compared with a joint that stands or torques of nothing."""
+    """Inertia is identified by then, and is not compared with a joint that stands, or torques of nothing."""
     late = session(("thesis_171_vertical", 2), Fault(kind, 32.5, math.inf, 0), planned="inertia")
     ending = ran(late, tmp_path / "run")
     assert (ending.name, check_folder(tmp_path / "run", ending).violations) == ("suspect", {})
     assert words in ending.text
     assert "in its held_out motion" in ending.text
+    dynamics = result(tmp_path / "run")["dynamics"]
+    assert dynamics["held_out"] is None
+    assert dynamics["identifiability"]
+
+
+def test_of_a_joint_that_halts_in_a_motion_for_inertia_none_is_identified(tmp_path: Path) -> None:
+    """What holds it is in the torques of all joints up to it."""
+    one = session(("thesis_171_vertical", 2), Fault("motor stall", 17.0, 1.5, 0), planned="inertia")
+    ending = ran(one, tmp_path / "run")
+    assert (ending.name, check_folder(tmp_path / "run", ending).violations) == ("suspect", {})
+    assert "in its dynamic motion" in ending.text
+    assert result(tmp_path / "run")["dynamics"] is None
 
 
 def test_predicted_torques_are_compared_with_the_true_ones(tmp_path: Path) -> None:

@@ -95,6 +95,8 @@ def test_clocks_jump_stand_still_and_drift() -> None:
     np.testing.assert_allclose(back, -forward)
     stuck, _ = history(Fault("clock stuck", 0.1, 0.2, 0))
     np.testing.assert_allclose(stuck[[99, 150, 299, 350], 0, 0], [0.0, -50.0, -199.0, -200.0])
+    slow, _ = history(Fault("clock drift", 0.1, 0.2, 0, size=0.498))
+    assert slow[200, 0, 0] < 0.0
     drift, _ = history(Fault("clock drift", 0.1, 0.2, 0, size=0.499))
     rate = DRIFT * 10.0 ** (2.0 * 0.499 - 2.0)
     np.testing.assert_allclose(

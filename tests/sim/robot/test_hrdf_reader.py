@@ -176,7 +176,7 @@ def test_hebi_py_moves_it_as_we_do_before_and_after_our_writer(tmp_path: Path, t
         ),
         (
             "<robot><link type='X5' extension='-1' twist='0'/></robot>",
-            "<link>: expected more than 0, found -1.0",
+            "<link>: length_m: expected more than 0, found -1.0",
         ),
         ("<robot><bracket type='X5LightLeft' mass_offset='-0.1'/></robot>", "expected at least 0"),
         ("<robot><end-effector type='X5Parallel' mass='1'/></robot>", "which only those of type Custom have"),
@@ -185,7 +185,7 @@ def test_hebi_py_moves_it_as_we_do_before_and_after_our_writer(tmp_path: Path, t
         ("<robot><rigid-body mass='1' output_trans='1 0'/></robot>", "has 2 numbers, not 3"),
         ("<robot><rigid-body mass='-1'/></robot>", "expected at least 0"),
         ("<robot><end-effector type='R8Parallel'/></robot>", "known are Custom, X5Parallel"),
-        ("<robot/>", "module: expected 1 or more entries"),
+        ("<robot/>", "it has no actuator"),
         ("<urdf/>", "its root is <urdf>"),
         ("<robot>", "no HRDF can be read"),
     ],
