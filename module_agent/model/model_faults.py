@@ -108,7 +108,8 @@ def _found(fault: "ErrorDetails") -> str:
     if kind == "union_tag_invalid":
         return repr(context["tag"])
     if kind in ("too_short", "too_long"):
-        return str(context["actual_length"])
+        length = context["actual_length"]
+        return "more" if length is None else str(length)
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if kind == "bytes_type":

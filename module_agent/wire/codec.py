@@ -17,6 +17,7 @@ from module_agent.wire.messages import (
     MAX_NAME,
     MAX_ROWS_BYTES,
     MAX_TEXT_BYTES,
+    OUT_OF_RANGE,
     SCHEMA_VERSION,
     Feedback,
     Message,
@@ -33,7 +34,7 @@ M = TypeVar("M", bound=Message)
 _FEEDBACK = tuple(Feedback.model_fields)
 # The types of maps and arrays from `unpackb`.
 _CONTAINERS = (dict, tuple)
-_RANGE_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
+_RANGE_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", OUT_OF_RANGE)
 
 
 def encode(message: Message) -> bytes:

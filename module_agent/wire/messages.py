@@ -5,12 +5,14 @@ boot id; a command carries the boot id of the module it is meant for, so that it
 Unknown fields are ignored; another schema version is refused by name.
 """
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 SCHEMA_VERSION = 1
+# The type of `out_of_range`, beside those of pydantic.
+OUT_OF_RANGE: Final = "out_of_range"
 
 Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 Counter = Annotated[int, Field(ge=0, lt=2**63)]
@@ -60,7 +62,7 @@ def cut(text: str) -> str:
 
 def out_of_range(detail: str) -> PydanticCustomError:
     """Return the error of fields that contradict each other, which `codec` reports as one of range."""
-    return PydanticCustomError("less_than_equal", "{detail}", {"detail": detail})
+    return PydanticCustomError(OUT_OF_RANGE, "{detail}", {"detail": detail})
 
 
 class Rest(Part):

@@ -4,8 +4,9 @@ from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core._pydantic_core import list_all_errors
 
-from module_agent.model.model_faults import faults_of, first_fault
+from module_agent.model.model_faults import _EXPECTED, _WHOLE, faults_of, first_fault
 
 
 class Inner(BaseModel):
@@ -98,3 +99,10 @@ def test_what_may_be_a_secret_is_not_repeated(secret: Any, found: str) -> None:
     with pytest.raises(ValidationError) as caught:
         Document.model_validate({"secret": secret})
     assert first_fault(caught.value) == f"secret: expected {found}"
+
+
+def test_every_sentence_has_the_values_that_pydantic_gives() -> None:
+    """One that lacked a value would end an agent by the message that it is to refuse."""
+    examples = {one["type"]: one["example_context"] or {} for one in list_all_errors()}
+    for kind, sentence in (_EXPECTED | _WHOLE).items():
+        assert "{" not in sentence.format(**examples[kind])
