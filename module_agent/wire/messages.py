@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 SCHEMA_VERSION = 1
-# The type of `out_of_range`, beside those of pydantic.
+# The type of `out_of_range`; pydantic has none of this name.
 OUT_OF_RANGE: Final = "out_of_range"
 
 Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
