@@ -40,7 +40,7 @@ TURNED_RAD = 0.05
 # A joint that turned by less than this share of its command was held, or its motor failed meanwhile.
 MIN_FOLLOWED = 0.2
 # It halted where that is so for this long while it was to turn by so much: what lasts for 0.75 s is found,
-# wherever it begins. A joint follows its command more closely than the last.
+# wherever it begins. Joints follow their commands within the last of these.
 HALTED_S, HALTED_RAD, FOLLOWED_RAD = 0.5, 0.1, 0.02
 # A position that changes by this much from one sample to the next, and neither before nor after it.
 JUMP_RAD = 0.02
