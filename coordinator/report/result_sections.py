@@ -227,7 +227,9 @@ def _rms(values: Array) -> float:
 
 def _torque_figures(held_out: HeldOutTorques | None) -> Iterator[Block]:
     if held_out is None:
-        yield Paragraph(text="There are no held-out motions to compare with.")
+        yield Paragraph(
+            text="There are no held-out motions to compare with, or a sensor or joint failed in them."
+        )
         return
     residual = np.sqrt(np.mean((held_out.measured_nm - held_out.predicted_nm) ** 2, axis=0))
     drawn = sorted(np.argsort(-residual)[:MAX_TORQUE_PLOTS])
