@@ -8,6 +8,7 @@ import pytest
 from coordinator.identification.signal_checks import (
     _clipped,
     _early_after,
+    _error_while_turning,
     _inertial,
     _jumps,
     _worst_halt,
@@ -167,9 +168,26 @@ def followed(
     return made
 
 
+def sticking(amplitude_rad: float, error_rad: float, turns: float = 3.2) -> Rows:
+    """A joint with friction and a soft loop: it stands until its position error is so large, and keeps it."""
+    made = followed(amplitude_rad=amplitude_rad, for_s=turns)
+    command = made["position_command_rad"].astype(float)
+    position = np.zeros(len(command))
+    for k in range(1, len(command)):
+        position[k] = np.clip(position[k - 1], command[k] - error_rad, command[k] + error_rad)
+    made["position_rad"] = position
+    made["motor_velocity_rad_s"] = GEAR * np.gradient(position, 4e-3)
+    return made
+
+
+def worst_halt(rows: Rows, *others: Rows) -> tuple[float, float] | None:
+    """Look for a halt in rows; these and other motions say at which position error the joint turns."""
+    return _worst_halt(rows, GEAR, max(map(_error_while_turning, (rows, *others))))
+
+
 @pytest.mark.parametrize("begin_s", [0.0, 0.26, 0.4, 1.05, 1.7, 2.4])
 def test_a_joint_that_stands_for_three_quarters_of_a_second_has_halted(begin_s: float) -> None:
-    found = _worst_halt(followed((begin_s, begin_s + 0.8)), GEAR)
+    found = worst_halt(followed((begin_s, begin_s + 0.8)))
     assert found is not None
     assert found[0] < 0.05
     assert found[1] > 0.2
@@ -188,21 +206,45 @@ def test_a_joint_that_stands_for_three_quarters_of_a_second_has_halted(begin_s: 
     ids=["well", "late", "small", "short", "empty"],
 )
 def test_a_joint_that_follows_its_command_has_not_halted(rows: Rows) -> None:
-    assert _worst_halt(rows, GEAR) is None
+    assert worst_halt(rows) is None
+
+
+@pytest.mark.parametrize("error_rad", [0.05, 0.2, 0.3])
+@pytest.mark.parametrize("amplitude_rad", [0.1, 0.2, 0.5])
+def test_a_joint_that_friction_holds_until_its_command_is_far_enough_has_not_halted(
+    amplitude_rad: float, error_rad: float
+) -> None:
+    rows, large = sticking(amplitude_rad, error_rad), sticking(1.0, error_rad)
+    assert _error_while_turning(large) == pytest.approx(error_rad, rel=0.02)
+    assert worst_halt(rows, large) is None
+
+
+@pytest.mark.parametrize("error_rad", [0.05, 0.2])
+def test_what_holds_a_joint_beyond_its_friction_is_a_halt(error_rad: float) -> None:
+    rows = sticking(0.5, error_rad)
+    # From midway between two reversals on, until the next midway but one.
+    rows["position_rad"][375:562] = rows["position_rad"][375]
+    rows["motor_velocity_rad_s"][375:562] = 0.0
+    assert worst_halt(rows, sticking(1.0, error_rad)) is not None
+
+
+def test_the_error_of_a_joint_that_hardly_turns_says_nothing() -> None:
+    assert _error_while_turning(sticking(0.1, 0.3)) == 0.0
+    assert _error_while_turning(followed()[:0]) == 0.0
 
 
 def test_a_joint_whose_motor_turns_has_a_sick_encoder_and_did_not_halt() -> None:
     rows = followed((0.5, 2.5))
     rows["motor_velocity_rad_s"] = GEAR * np.gradient(rows["position_command_rad"], 4e-3)
-    assert _worst_halt(rows, GEAR) is None
+    assert worst_halt(rows) is None
 
 
 def test_without_a_command_or_with_a_hole_in_its_rows_a_joint_is_not_said_to_halt() -> None:
     rows = followed((0.5, 2.5))
     rows["position_command_rad"] = np.nan
-    assert _worst_halt(rows, GEAR) is None
+    assert worst_halt(rows) is None
     # Nine rows in ten are gone while it stood.
     held = followed((0.5, 2.5))
     kept = np.r_[0:120, 130:620:10, 630:800]
-    assert _worst_halt(held, GEAR) is not None
-    assert _worst_halt(held[kept], GEAR) is None
+    assert worst_halt(held) is not None
+    assert worst_halt(held[kept]) is None
