@@ -40,11 +40,13 @@ class Summary(NamedTuple):
     sigmas_off: |error| / claimed sigma of every interval that was claimed, for the coverage over all cases.
     over_bound: |error| / its least standard deviation by the physical limit, by what was measured where; a
         case has too few for a bar, all cases together have not.
+    reasons: why trials count as missed that ended without what the rows are of.
     """
 
     rows: Sequence[Row]
     sigmas_off: Sequence[float] = ()
     over_bound: Mapping[str, Sequence[float]] = {}
+    reasons: Sequence[str] = ()
 
 
 class Case(NamedTuple):
@@ -61,7 +63,10 @@ class Case(NamedTuple):
 
 
 class CaseResult(NamedTuple):
-    """The result of a case; failures described. cpu_s: processor time of all its trials."""
+    """The result of a case. failures: what trials failed at, or why they count as missed.
+
+    cpu_s: processor time of all its trials.
+    """
 
     case: str
     trials: int
@@ -79,7 +84,8 @@ def concluded(case: Case, results: Sequence[Any], cpu_s: float = 0.0) -> CaseRes
         row._replace(case=case.name, profile=case.profile, known=case.known)
         for row in (*failed, *summary.rows)
     ]
-    return CaseResult(case.name, len(results), summary._replace(rows=rows), failures, cpu_s)
+    told = (*failures, *summary.reasons)
+    return CaseResult(case.name, len(results), summary._replace(rows=rows), told, cpu_s)
 
 
 def trial_seeds(seed: int, name: str, trials: int) -> list[int]:

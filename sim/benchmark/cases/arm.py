@@ -299,7 +299,8 @@ def _summary(arm: str, noise: str, mode: Mode, shortened: bool, trials: Sequence
     if mode == "joint" and arm == COST_ARM:
         took = median([trial.identify_s for trial in done]) if done else None
         rows.append(Row("refinement and all before it, median [s of a core]", took, REFINEMENT_S))
-    return Summary(rows, sigmas_off(trials), _over_bound(trials) if noise == "x5" and not shortened else {})
+    over_bound = _over_bound(trials) if noise == "x5" and not shortened else {}
+    return Summary(rows, sigmas_off(trials), over_bound, reasons(trials))
 
 
 def _over_bound(trials: Sequence[ArmTrial]) -> dict[str, list[float]]:
@@ -316,6 +317,12 @@ def sigmas_off(trials: Sequence[ArmTrial]) -> list[float]:
     pairs = [(e, link.sigma_m) for link in links if (e := link.error_m) is not None and link.sigma_m]
     # Unknown is a miss: a length over infinity would be covered by any claim.
     return [abs(error_m) / sigma_m if np.isfinite(sigma_m) else np.inf for error_m, sigma_m in pairs]
+
+
+def reasons(trials: Sequence[ArmTrial]) -> list[str]:
+    """Return why trials count as wrong, with their seeds."""
+    wrong = [trial for trial in trials if not trial.right]
+    return [f"seed {trial.seed}: {trial.why or '; '.join(trial.differences)}" for trial in wrong]
 
 
 def wrong_row(trials: Sequence[ArmTrial]) -> Row:

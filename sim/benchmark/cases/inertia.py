@@ -145,7 +145,8 @@ def _compared(trial: InertiaTrial, session: IdentifiedSession, designed: Chain, 
     kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
     serials, chain = kinematics.topology.serials, true_chain(robot)
     if inertia is None or bodies is None or serials != chain.serials:
-        return trial._replace(why=f"no inertia was identified of {', '.join(chain.serials)}")
+        what = "; ".join([f"no inertia was identified of {', '.join(chain.serials)}", *found.result.suspicions])
+        return trial._replace(why=what)
     base = bodies.base
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in joint_frames(chain)))
     true = base.grouping @ (into @ true_inertia(robot).ravel())
@@ -314,7 +315,7 @@ def _summary(arm: str, label: str, trials: Sequence[InertiaTrial]) -> Summary:
         count("poses with a mass matrix that is not definite", definite),
         Row("noise left in torques, encoders over IMUs", gain),
     ]
-    return Summary(rows, off)
+    return Summary(rows, off, reasons=[f"seed {trial.seed}: {trial.why}" for trial in trials if trial.why])
 
 
 def _sigma_rows(off: Sequence[float]) -> list[Row]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from coordinator.excitation.plan import Plan
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
-from sim.benchmark.cases.arm import KNOWN, TIP_MM, ArmTrial, arm_trial, sigmas_off, wrong_row
+from sim.benchmark.cases.arm import KNOWN, TIP_MM, ArmTrial, arm_trial, reasons, sigmas_off, wrong_row
 from sim.benchmark.row import ENOUGH_TRIALS, Row, coverage, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 
@@ -56,13 +56,14 @@ def _pairs(trials: Sequence[ArmTrial]) -> Summary:
         Row(f"link lengths, {over}", ratio(rms(_lengths(poor)), rms(_lengths(perfect))), limit),
         *_absolute_rows(poor),
     ]
-    return Summary(rows, sigmas_off(list(right.values())))
+    return Summary(rows, sigmas_off(list(right.values())), reasons=reasons(trials))
 
 
 def _bad(trials: Sequence[ArmTrial]) -> Summary:
     right = [trial for trial in trials if trial.right]
     off = sigmas_off(right)
-    return Summary([wrong_row(trials), coverage(off), *_absolute_rows(right)], off)
+    rows = [wrong_row(trials), coverage(off), *_absolute_rows(right)]
+    return Summary(rows, off, reasons=reasons(trials))
 
 
 def _tips(trials: Sequence[ArmTrial]) -> list[float | None]:

@@ -207,6 +207,12 @@ def test_an_arms_tip_is_the_rms_over_its_trials_with_the_thesis_beside() -> None
     assert summary.sigmas_off == pytest.approx([2.0] * 13)
 
 
+def test_why_an_arm_counts_as_wrong_is_said() -> None:
+    case = case_named(arm_cases(13, 0), f"{COST_ARM}, x5, joint by joint")
+    trials = [arm(0.6), arm(0.6, seed=2, why="it fell"), arm(0.6, seed=3, differences=("a", "b"))]
+    assert case.summarise(trials).reasons == ["seed 2: it fell", "seed 3: a; b"]
+
+
 def test_uncalibrated_arms_have_four_millimetres_and_no_bar_for_what_their_imus_cannot_know() -> None:
     case = case_named(arm_cases(13, 0), "arm7, x5-uncalibrated")
     found = rows(case.summarise([arm(3.0)] * 13))

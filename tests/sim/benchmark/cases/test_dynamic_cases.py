@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.benchmark.case import Case, Summary
+from sim.benchmark.case import Case, Summary, concluded
 from sim.benchmark.cases.inertia import InertiaTrial
 from sim.benchmark.cases.monitoring import Alarms, MonitoredSegments, MonitoringTrial
 from sim.benchmark.cases.payload import PayloadTrial
@@ -87,6 +87,12 @@ def test_a_session_that_did_not_come_to_its_end_is_counted() -> None:
     found = rows("a2085_06, x5, inertia", inertia(), inertia(why="module elbow was lost"))
     assert found["runs without inertia, of 2"].ours == 1.0
     assert found["held-out torque, worst [%]"].ours == pytest.approx(0.7)
+
+
+def test_why_a_session_identified_no_inertia_is_said() -> None:
+    trials = [inertia(), inertia(seed=7, why="module elbow was lost")]
+    told = concluded(CASES["a2085_06, x5, inertia"], trials).failures
+    assert told == ("seed 7: module elbow was lost",)
 
 
 def test_the_rigid_arms_bar_is_the_tighter_one() -> None:
