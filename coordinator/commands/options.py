@@ -14,7 +14,7 @@ from coordinator.runtime.command_line import in_a_folder
 from coordinator.runtime.event_loop import check_speed
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.model.errors import UsageError
-from module_agent.model.model_faults import first_fault
+from module_agent.model.model_faults import faults_of
 from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.credentials import COORDINATOR, OBSERVER, load_credentials
@@ -113,6 +113,10 @@ class AgainOptions:
     speed: Speed = 1.0
 
 
+# Options that are not called as the settings of a plan that they are.
+_SETTINGS = {"amplitude": "sine_amplitude_rad", "home": "home_rad"}
+
+
 @dataclass(frozen=True)
 class PlanOptions:
     """How a robot is identified: a plan's file, and settings that take precedence over it."""
@@ -143,8 +147,8 @@ class PlanOptions:
     def chosen(self) -> Plan:
         """Return the plan with these settings; see `planned`."""
         given = dataclasses.asdict(self)
-        path, amplitude, home = (given.pop(name) for name in ("plan", "amplitude", "home"))
-        return planned(path, sine_amplitude_rad=amplitude, home_rad=home, **given)
+        path = given.pop("plan")
+        return planned(path, **{_SETTINGS.get(name, name): value for name, value in given.items()})
 
     def arguments(self) -> tuple[str, ...]:
         """Return these options as a command line has them."""
@@ -161,11 +165,18 @@ def planned(path: Path | None, **given: object) -> Plan:
     """Return the plan of a file, or the default one, with the settings that are given (not None).
 
     Raises:
-        UsageError: the file is no plan, or a setting is out of range.
+        UsageError: the file is no plan, or a setting is out of range: it is named by its option.
     """
+    base = load_plan(path) if path is not None else Plan()
+    set_here = {name: value for name, value in given.items() if value is not None}
     try:
-        base = load_plan(path) if path is not None else Plan()
         # Validated again: an option can be out of range as well.
-        return Plan.model_validate({**base.model_dump(), **{k: v for k, v in given.items() if v is not None}})
+        return Plan.model_validate({**base.model_dump(), **set_here})
     except ValidationError as error:
-        raise UsageError(first_fault(error)) from error
+        options = {setting: name for name, setting in _SETTINGS.items()}
+        lines = []
+        for location, reason in faults_of(error):
+            name = ".".join(map(str, location))
+            option = f"--{options.get(name, name)}" if name in set_here else name
+            lines.append(f"{option}: {reason}" if name else reason)
+        raise UsageError("\n".join(lines)) from error

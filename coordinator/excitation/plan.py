@@ -134,7 +134,9 @@ def load_plan(path: Path) -> Plan:
     try:
         return Plan.model_validate(table)
     except ValidationError as error:
-        location, reason = faults_of(error)[0]
-        if location[0] not in Plan.model_fields:
-            reason = f"unknown setting; known are {', '.join(Plan.model_fields)}"
-        raise UsageError(fault_lines([(location, reason)], text, path)) from error
+        known = f"unknown setting; known are {', '.join(Plan.model_fields)}"
+        faults = [
+            (location, reason if not location or location[0] in Plan.model_fields else known)
+            for location, reason in faults_of(error)
+        ]
+        raise UsageError(fault_lines(faults, text, path)) from error

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import CATALOGUE
-from module_agent.model.model_faults import first_fault
+from module_agent.model.model_faults import faults_of, first_fault
 from sim.geometry.link_parts import BRACKETS, End, FreePose, Part, Tube, placed
 from sim.geometry.pose import Array
 from sim.geometry.rigid_body import RigidBody, joined, moved
@@ -173,7 +173,9 @@ class _Reader:
         try:
             return Tube(length_m=length, twist_rad=twist, input=_OURS[first], output=_OURS[last])
         except ValidationError as error:
-            raise self._fail(f"<{element.tag}>: {first_fault(error)}") from error
+            place, reason = faults_of(error)[0]
+            name = {"length_m": "extension", "twist_rad": "twist"}.get(str(place[0]), "") if place else ""
+            raise self._fail(f"<{element.tag}>: {name + ': ' if name else ''}{reason}") from error
 
     def _solid(self, element: Element, prefix: str) -> FreePose:
         """Return a rigid body; its output is as attributes with this prefix say, none without."""

@@ -145,8 +145,8 @@ def _compared(trial: InertiaTrial, session: IdentifiedSession, designed: Chain, 
     kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
     serials, chain = kinematics.topology.serials, true_chain(robot)
     if inertia is None or bodies is None or serials != chain.serials:
-        what = "; ".join([f"no inertia was identified of {', '.join(chain.serials)}", *found.result.suspicions])
-        return trial._replace(why=what)
+        none = f"no inertia was identified of {', '.join(chain.serials)}"
+        return trial._replace(why="; ".join([none, *found.result.suspicions]))
     base = bodies.base
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in joint_frames(chain)))
     true = base.grouping @ (into @ true_inertia(robot).ravel())

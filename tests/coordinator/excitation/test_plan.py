@@ -100,6 +100,16 @@ def test_a_file_that_is_no_plan_is_refused_with_line_and_setting(
         load_plan(path)
 
 
+def test_all_that_is_wrong_with_a_plan_is_said_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text("rest_s = -1.0\nretries = 6\ncolour = 1\n")
+    with pytest.raises(UsageError) as refused:
+        load_plan(path)
+    lines = str(refused.value).splitlines()
+    assert [line.split(": ")[1] for line in lines] == ["rest_s", "retries", "colour"]
+    assert [line.split(":")[1] for line in lines] == ["1", "2", "3"]
+
+
 @pytest.mark.parametrize(("field", "value"), [("mode", "half"), ("motions", "best"), ("precision_mm", 0.0)])
 def test_modes_and_motions_that_there_are_not_are_refused_by_field(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):

@@ -176,7 +176,7 @@ def test_hebi_py_moves_it_as_we_do_before_and_after_our_writer(tmp_path: Path, t
         ),
         (
             "<robot><link type='X5' extension='-1' twist='0'/></robot>",
-            "<link>: length_m: expected more than 0, found -1.0",
+            "<link>: extension: expected more than 0, found -1.0",
         ),
         ("<robot><bracket type='X5LightLeft' mass_offset='-0.1'/></robot>", "expected at least 0"),
         ("<robot><end-effector type='X5Parallel' mass='1'/></robot>", "which only those of type Custom have"),
