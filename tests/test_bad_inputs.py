@@ -191,6 +191,8 @@ def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         assert said, where
         for word in ("Traceback", "pydantic", "KeyError", "validation error", "errors.py", "NoneType"):
             assert word not in said, where
+        # A file is read before anybody is looked for.
+        assert "do its agents run" not in said, where
         # The parser's own errors begin with how to use the command.
         assert said.startswith("Usage:") or f"{program}: " in said, where
         assert sorted(os.walk(tmp_path)) == before, where

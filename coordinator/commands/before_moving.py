@@ -102,9 +102,10 @@ def load(
     Exit codes: 0 all have them, 1 a module is missing or refuses, 2 wrong usage.
     """
     note = Terminal(at.quiet).note
+    chosen = read_gains(file)
     loop = ScaledLoop()
     session = _session(at, loop, expect, module or ())
-    loaded = attend(loop, session.load_gains(lambda present: read_gains(file, present)))
+    loaded = attend(loop, session.load_gains(chosen.applied))
     note(f"{file}: loaded into {', '.join(loaded)}")
 
 

@@ -10,7 +10,7 @@ read.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 from xml.etree.ElementTree import (
     Element,
     ParseError,
@@ -24,7 +24,8 @@ from xml.etree.ElementTree import (
 
 from pydantic import ValidationError
 
-from module_agent.control.gains import for_message, from_message
+from module_agent.control.gains import default_gains, for_message, from_message
+from module_agent.model.catalogue import module_type
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
 from module_agent.model.model_faults import first_fault
@@ -33,6 +34,8 @@ from module_agent.wire.messages import GainSet, PidGains
 ROOTS = ("group_gains", "gains")
 LOOPS = ("position", "velocity", "effort")
 STRATEGIES = ("Off", "DirectPWM", "Strategy2", "Strategy3", "Strategy4")
+
+T = TypeVar("T")
 
 
 class GainsFileError(UsageError):
@@ -50,12 +53,51 @@ class _Elements(TreeBuilder):
         raise GainsFileError(f"{self._path}: a document type has no place in a gains file")
 
 
-def read_gains(path: Path, present: Sequence[GainSet]) -> list[GainSet]:
-    """Return the gains of a file for modules that have the `present` ones, in their order.
+class GainsFile(NamedTuple):
+    """What a gains file says: of each element one value for all modules, or one for each.
+
+    Attributes:
+        path: the file.
+        strategies: control strategies, 0-4; none if the file does not say them.
+        gains: values by loop and gain.
+    """
+
+    path: Path
+    strategies: list[int]
+    gains: dict[tuple[str, str], list[float | bool]]
+
+    def applied(self, present: Sequence[GainSet]) -> list[GainSet]:
+        """Return the gains for modules that have the `present` ones, in their order.
+
+        Raises:
+            GainsFileError: the file is for another number of modules, or their gains cannot be with those of
+                the file.
+        """
+        sets: list[dict[str, Any]] = [one.model_dump() for one in present]
+        if self.strategies:
+            for own, strategy in zip(
+                sets, self._each("control_strategy", self.strategies, len(sets)), strict=True
+            ):
+                own["strategy"] = strategy
+        for (loop, name), values in self.gains.items():
+            for own, value in zip(sets, self._each(name, values, len(sets)), strict=True):
+                own[loop][name] = value
+        try:
+            return [GainSet.model_validate(own) for own in sets]
+        except ValidationError as error:
+            raise GainsFileError(f"{self.path}: {first_fault(error)}") from error
+
+    def _each(self, name: str, values: list[T], modules: int) -> list[T]:
+        if len(values) not in (1, modules):
+            raise GainsFileError(f"{self.path}: <{name}> has {len(values)} values for {modules} modules")
+        return values * modules if len(values) == 1 else values
+
+
+def read_gains(path: Path) -> GainsFile:
+    """Return what a gains file says.
 
     Raises:
-        GainsFileError: no such file, not of this format, for another number of modules, or a gain that
-            cannot be.
+        GainsFileError: no such file, not of this format, or a gain that cannot be.
     """
     try:
         root = fromstring(path.read_text(encoding="utf-8"), XMLParser(target=_Elements(path)))
@@ -63,21 +105,20 @@ def read_gains(path: Path, present: Sequence[GainSet]) -> list[GainSet]:
         raise GainsFileError(f"{path}: no gains file can be read: {error}") from error
     if root.tag not in ROOTS:
         raise GainsFileError(f"{path}: its root is <{root.tag}>, that of a gains file is <{ROOTS[0]}>")
-    sets: list[dict[str, Any]] = [one.model_dump() for one in present]
+    found = GainsFile(path, [], {})
     for element in root:
         if element.tag == "control_strategy":
-            for own, word in zip(sets, _words(path, element, len(sets)), strict=True):
-                own["strategy"] = _strategy(path, word)
+            found.strategies[:] = [_strategy(path, word) for word in _words(path, element)]
         elif element.tag in LOOPS:
             for gain in element:
-                for own, word in zip(sets, _words(path, gain, len(sets)), strict=True):
-                    own[element.tag][gain.tag] = _value(path, element.tag, gain.tag, word)
+                values = [_value(path, element.tag, gain.tag, word) for word in _words(path, gain)]
+                found.gains[element.tag, gain.tag] = values
         else:
             raise GainsFileError(f"{path}: unknown element <{element.tag}>")
-    try:
-        return [GainSet.model_validate(own) for own in sets]
-    except ValidationError as error:
-        raise GainsFileError(f"{path}: {first_fault(error)}") from error
+    # What no module takes, and elements for different numbers of modules, are refused before one is asked.
+    modules = max((len(found.strategies), *(len(values) for values in found.gains.values()), 1))
+    found.applied([default_gains(module_type("X5-1"), 3)] * modules)
+    return found
 
 
 def write_gains(path: Path, gains: Sequence[GainSet]) -> None:
@@ -93,11 +134,11 @@ def write_gains(path: Path, gains: Sequence[GainSet]) -> None:
     write_text(path, '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n")
 
 
-def _words(path: Path, element: Element, modules: int) -> list[str]:
+def _words(path: Path, element: Element) -> list[str]:
     words = (element.text or "").split()
-    if len(words) not in (1, modules):
-        raise GainsFileError(f"{path}: <{element.tag}> has {len(words)} values for {modules} modules")
-    return words * modules if len(words) == 1 else words
+    if not words:
+        raise GainsFileError(f"{path}: <{element.tag}> has no value")
+    return words
 
 
 def _strategy(path: Path, word: str) -> int:

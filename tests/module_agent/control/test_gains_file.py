@@ -48,7 +48,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_a_partial_file_changes_what_it_says_and_nothing_else(file: Path) -> None:
-    first, second = read_gains(file, FACTORY)
+    first, second = read_gains(file).applied(FACTORY)
     assert (first.strategy, second.strategy) == (4, 2)
     assert (first.position.kp, second.position.kp) == (15.0, 10.5)
     assert (first.position.d_on_error, second.position.d_on_error) == (False, True)
@@ -61,13 +61,13 @@ def test_a_partial_file_changes_what_it_says_and_nothing_else(file: Path) -> Non
 
 
 def test_what_is_written_is_read_again(file: Path, tmp_path: Path) -> None:
-    gains = read_gains(file, FACTORY)
+    gains = read_gains(file).applied(FACTORY)
     write_gains(tmp_path / "out.xml", gains)
-    assert read_gains(tmp_path / "out.xml", FACTORY) == gains
+    assert read_gains(tmp_path / "out.xml").applied(FACTORY) == gains
 
 
 def test_limits_that_are_none_are_taken_by_a_module_and_stay_none(file: Path, tmp_path: Path) -> None:
-    for own in read_gains(file, FACTORY):
+    for own in read_gains(file).applied(FACTORY):
         check_gains(own)
     file.write_text(
         "<group_gains>"
@@ -78,9 +78,9 @@ def test_limits_that_are_none_are_taken_by_a_module_and_stay_none(file: Path, tm
         )
         + "</group_gains>"
     )
-    for own in read_gains(file, FACTORY):
+    for own in read_gains(file).applied(FACTORY):
         check_gains(own)
-    write_gains(tmp_path / "out.xml", read_gains(file, FACTORY))
+    write_gains(tmp_path / "out.xml", read_gains(file).applied(FACTORY))
     text = (tmp_path / "out.xml").read_text()
     for name, value in (("i_clamp", "inf"), ("min_output", "-inf"), ("max_target", "inf")):
         assert text.count(f"<{name}>{value} {value}</{name}>") == len(LOOPS)
@@ -137,12 +137,12 @@ def _arm(folder: Path) -> Path:
 
 def test_the_gains_of_an_arm_of_the_manufacturers_keep_their_meaning(tmp_path: Path) -> None:
     path = _arm(tmp_path)
-    gains = read_gains(path, [default_gains(module_type("X5-1"), 0)] * 7)
+    gains = read_gains(path).applied([default_gains(module_type("X5-1"), 0)] * 7)
     for own in gains:
         check_gains(own)
     assert [own.position.ki for own in gains] == [50.0, 50.0, 25.0, 25.0, 10.0, 5.0, 5.0]
     write_gains(tmp_path / "out.xml", gains)
-    assert read_gains(tmp_path / "out.xml", gains[::-1]) == gains
+    assert read_gains(tmp_path / "out.xml").applied(gains[::-1]) == gains
     try:
         hebi = hebi_library.library()
     except UsageError:
@@ -161,13 +161,17 @@ def test_the_gains_of_an_arm_of_the_manufacturers_keep_their_meaning(tmp_path: P
 def test_a_gain_that_is_no_limit_cannot_be_infinite(file: Path) -> None:
     file.write_text("<group_gains><position><kp>inf</kp></position></group_gains>")
     with pytest.raises(WireError, match=r"kp 1e\+06 of the position loop; possible are -1000 \.\. 1000$"):
-        check_gains(read_gains(file, FACTORY)[0])
+        check_gains(read_gains(file).applied(FACTORY)[0])
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<group_gains><position><kp>1 2 3</kp></position></group_gains>", "<kp> has 3 values for 2 modules"),
+        (
+            "<group_gains><position><kp>1 2 3</kp><kd>1 2</kd></position></group_gains>",
+            "<kd> has 2 values for 3 modules",
+        ),
+        ("<group_gains><position><kp/></position></group_gains>", "<kp> has no value"),
         ("<group_gains><position><kq>1</kq></position></group_gains>", "unknown element <kq> in <position>"),
         ("<group_gains><position><kp>x</kp></position></group_gains>", "position.kp: 'x' is no number"),
         ("<group_gains><position><kp>nan</kp></position></group_gains>", "'nan' is no number"),
@@ -188,9 +192,15 @@ def test_a_gain_that_is_no_limit_cannot_be_infinite(file: Path) -> None:
 def test_what_is_wrong_is_named(file: Path, text: str, message: str) -> None:
     file.write_text(text)
     with pytest.raises(GainsFileError) as error:
-        read_gains(file, FACTORY)
+        read_gains(file)
     assert message in str(error.value)
     assert str(file) in str(error.value)
+
+
+def test_a_file_for_three_modules_is_refused_by_two(file: Path) -> None:
+    file.write_text("<group_gains><position><kp>1 2 3</kp></position></group_gains>")
+    with pytest.raises(GainsFileError, match="<kp> has 3 values for 2 modules"):
+        read_gains(file).applied(FACTORY)
 
 
 def test_hebi_py_reads_our_files_and_we_read_its(tmp_path: Path) -> None:
@@ -207,7 +217,7 @@ def test_hebi_py_reads_our_files_and_we_read_its(tmp_path: Path) -> None:
         for loop in LOOPS:
             _same(command, index, loop, getattr(gains, loop))
     command.write_gains(str(tmp_path / "theirs.xml"))
-    theirs = read_gains(tmp_path / "theirs.xml", [_other(one) for one in FACTORY])
+    theirs = read_gains(tmp_path / "theirs.xml").applied([_other(one) for one in FACTORY])
     for own, read in zip(FACTORY, theirs, strict=True):
         assert STRATEGIES[read.strategy] == STRATEGIES[own.strategy]
         for loop in LOOPS:
