@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo kinematics dynamics watch thesis test coverage safety mutants check bench clean
+.PHONY: help demo kinematics dynamics watch thesis test test-all coverage safety mutants check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh in processes of its own, and is scored"
@@ -17,7 +17,8 @@ help:
 	@echo "make dynamics    inertia, payloads, torque control and monitoring, every row in about a minute"
 	@echo "make watch   a night: 100 hours of everyday use under the monitor, and changes that grow slowly"
 	@echo "make thesis  the thesis' experiments side by side with what was printed, few trials, under three minutes"
-	@echo "make test    all tests"
+	@echo "make test    the tests that a merge must pass"
+	@echo "make test-all  these, and further robots, seeds and settings of what they tell; twice as long"
 	@echo "make coverage  branch coverage of what runs in one process"
 	@echo "make safety  branch coverage of the safety core, which must be whole"
 	@echo "make mutants every change of the safety core that its tests do not notice; half an hour, goes on where it stopped"
@@ -67,9 +68,11 @@ thesis: $(STAMP)
 	@echo "Read it: runs/thesis/report.html"
 
 # Processes in real time have the machine to themselves: next to other work their messages come too late.
-test: $(DEV)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not integration and not benchmark"
-	$(BIN)/python -m pytest -m "integration and not benchmark"
+test: LEFT_OUT := benchmark or breadth
+test-all: LEFT_OUT := benchmark
+test test-all: $(DEV)
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not (integration or $(LEFT_OUT))"
+	$(BIN)/python -m pytest -m "integration and not ($(LEFT_OUT))"
 
 # Processes of their own and compiled kernels are not counted; tracing makes everything about twice as slow.
 coverage: $(DEV)

@@ -27,6 +27,9 @@ from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
 from sim import simulate
 
+# Tests of this file share one run: they stay in one process.
+pytestmark = pytest.mark.xdist_group("examples")
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 EXAMPLES = ROOT / "docs" / "examples"

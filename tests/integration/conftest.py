@@ -181,7 +181,9 @@ def plan(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture(params=[False, True], ids=["loops", "driver"])
+@pytest.fixture(
+    params=[pytest.param(False, id="loops"), pytest.param(True, id="driver", marks=pytest.mark.breadth)]
+)
 def through_driver(request: pytest.FixtureRequest) -> bool:
     """Whether the agents speak to their modules through the driver of real ones."""
     return bool(request.param)

@@ -1,6 +1,7 @@
 """A coordinator that dies in the middle of a motion: the robot stops by itself, and the run is resumed."""
 
 import numpy as np
+import pytest
 
 from coordinator.live_robot.commander import KEEP_ALIVE_S, LEASE_NS
 from coordinator.recording.recording import Recording
@@ -11,6 +12,7 @@ from sim.scoring.score import score
 EXPIRED = STATE_NAMES.index("expired")
 
 
+@pytest.mark.parametrize("through_driver", [False, True], ids=["loops", "driver"], indirect=True)
 def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(
     launcher, client, through_driver
 ) -> None:

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from sim.faults.invariants import SIGMAS
+from tests.breadth import breadth
 
 
-@pytest.mark.parametrize("robot", ["thesis_484_horizontal", "thesis_484_vertical"])
+@pytest.mark.parametrize("robot", ["thesis_484_vertical", *breadth("thesis_484_horizontal")])
 def test_an_arm_of_the_thesis_is_identified_over_zenoh(
     robot: str, programs, endpoint: str, plan: Path, tmp_path: Path
 ) -> None:

@@ -7,6 +7,7 @@ import pytest
 from coordinator.attendant.workspace import Box
 from coordinator.identification.identify import identify_kinematics
 from coordinator.monitoring.reference import UnsuitableBaseline
+from tests.breadth import breadth
 from tests.simulation.attended_robot import CHANGES, LAST, ROOM, Scene, remeasured
 from tests.simulation.known_arm import ARM, LOADED
 
@@ -39,7 +40,7 @@ def test_what_the_run_leaves_open_is_said(
     assert scene.ears.heard("hardly moved its joints together")
 
 
-@pytest.mark.parametrize("name", ["0.2 kg put on", "a module exchanged", "a module added"])
+@pytest.mark.parametrize("name", ["0.2 kg put on", *breadth("a module exchanged", "a module added")])
 def test_what_has_changed_is_measured_again_and_the_new_model_holds(
     name: str, known_arm: Path, tmp_path: Path
 ) -> None:

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
@@ -14,10 +14,10 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify
 from coordinator.recording.run_folder import load_recording
 from coordinator.session.run import write_outputs
-from sim.physics.engine import Physics
+from tests.breadth import breadth
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.parametrize("physics", get_args(Physics))
+pytestmark = pytest.mark.parametrize("physics", ["compiled", *breadth("pybullet")])
 
 
 def _run(out: Path, plan: Plan, physics: str, seed: int, hash_seed: str) -> str:

@@ -15,6 +15,7 @@ from module_agent.model.chain import Chain
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.score import score
+from tests.breadth import breadth
 
 Rigs = Callable[..., Any]
 WHOLE = Plan(mode="simultaneous", dynamics=False, imu="calibrated")
@@ -71,7 +72,7 @@ def parents(chain: Chain) -> dict[str, str | None]:
     return {s: chain.serials[p] if p >= 0 else None for s, p in zip(chain.serials, chain.parent, strict=True)}
 
 
-@pytest.mark.parametrize("network", ["lan", "wifi"])
+@pytest.mark.parametrize("network", ["wifi", *breadth("lan")])
 def test_the_branches_of_a_tree_are_told_apart_when_both_move(
     rigs: Rigs, tmp_path: Path, network: str
 ) -> None:

@@ -13,6 +13,9 @@ from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.parameter_fit.base_parameters import into_frames
 from module_agent.model.chain import Array
 
+# Tests of this file share one fit: they stay in one process.
+pytestmark = pytest.mark.xdist_group("six_joints")
+
 JOINTS = tuple(f"j{i}" for i in range(1, 7))
 MASSES = (8.0, 5.0, 3.5, 2.0, 1.2, 0.5)
 # Places and axes of a usual arm: an upright waist, two joints across, and a wrist.
