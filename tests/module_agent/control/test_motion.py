@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from module_agent.control.gains import catalogue_limits
-from module_agent.control.motion import MAX_SAMPLES, Motion, effort_at, effort_profile, profile_period_ns
+from module_agent.control.motion import (
+    MAX_MOTION_S,
+    MAX_SAMPLES,
+    MAX_STEP_RAD,
+    Motion,
+    check_duration,
+    check_setpoint,
+    effort_at,
+    effort_profile,
+    profile_period_ns,
+)
 from module_agent.control.waveform import waveform
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Incoming, Publication
@@ -20,11 +30,14 @@ from module_agent.wire.messages import (
     ConstantMotion,
     EffortProfile,
     Feedback,
+    GoTo,
     LeaseRequest,
+    Limits,
     Message,
     MotionCommand,
     MultiSine,
     Rest,
+    Setpoint,
     Sine,
     WindowedSine,
 )
@@ -136,11 +149,80 @@ def test_efforts_that_are_no_numbers_are_refused_and_nothing_moves(
     [
         WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=1e-3, sigma_s=5e-324),
         MultiSine(sines=(Sine(amplitude_rad=0.1, frequency_hz=1.0),), duration_s=5e-324),
+        # Its positions are finite, its speeds are not.
+        WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=1e-3, sigma_s=1e-160),
     ],
 )
 def test_a_motion_that_computes_to_no_number_is_refused(pattern: Any) -> None:
-    with pytest.raises(WireError, match="no finite targets"):
+    with np.errstate(all="raise"), pytest.raises(WireError, match="no finite targets"):
         Motion(pattern, 0.0, 0)
+
+
+@pytest.mark.parametrize("duration_s", [2e-4, 0.4, 59.999])
+def test_a_motion_is_sampled_from_its_start_to_its_end_and_holds_what_comes_last(duration_s: float) -> None:
+    motion = Motion(Rest(duration_s=duration_s), 0.3, 7)
+    steps = max(1, round(duration_s * 1e3))
+    assert motion.span_ns == (7, 7 + steps * MS)
+    assert motion.targets.shape == (3, steps + 1)
+    # It ends before its ramp is over, as no pattern does: the last two samples differ.
+    ramp = Motion(ConstantMotion(velocity_rad_s=1.5, duration_s=0.4, ramp_s=0.0), 0.3, 7, RAMP)
+    assert ramp.last_position_rad == ramp.targets[0, -1] > ramp.targets[0, -2]
+    assert ramp.last_effort_nm == ramp.targets[2, -1]
+
+
+def test_a_motion_of_a_minute_is_taken_and_no_longer_one() -> None:
+    longest = GoTo(target_rad=1.0, max_speed_rad_s=1.875 / MAX_MOTION_S)
+    check_duration(longest, 0.0)
+    with pytest.raises(WireError, match="the motion would take 61 s, at most 60 s are taken") as refused:
+        check_duration(longest.model_copy(update={"max_speed_rad_s": 1.875 / 61.0}), 0.0)
+    assert refused.value.reason is Refusal.LIMIT
+
+
+def _limits(**changes: float) -> Limits:
+    return catalogue_limits(KIND).model_copy(update=changes)
+
+
+def _setpoint(**values: float) -> Setpoint:
+    asked = {"position_rad": None, "velocity_rad_s": None, "effort_nm": None, **values}
+    head = {"serial": "A", "boot": 1, "seq": 1, "sender": "me", "token": 1, "echo_ns": 0}
+    return Setpoint.model_validate({**head, **asked})
+
+
+@pytest.mark.parametrize(
+    ("values", "limits", "measured_rad"),
+    [
+        # From where the joint is, however far that is from zero, one turn and no more.
+        ({"position_rad": 9.0}, {}, 9.0),
+        ({"position_rad": MAX_STEP_RAD}, {}, 0.0),
+        # Without a velocity none is compared, nor is an effort.
+        ({"position_rad": 0.0}, {"max_speed_rad_s": 0.01, "max_effort_nm": 0.01}, 0.0),
+        ({"velocity_rad_s": 5.0}, {"max_speed_rad_s": 0.5}, 0.0),
+        ({"effort_nm": -5.0}, {"max_effort_nm": 0.5}, 0.0),
+        ({"position_rad": -1.0}, {"min_position_rad": -1.0, "max_position_rad": 1.0}, 0.0),
+        ({"position_rad": 1.0}, {"min_position_rad": -1.0, "max_position_rad": 1.0}, 0.0),
+    ],
+)
+def test_a_setpoint_at_a_limit_is_taken(
+    values: dict[str, float], limits: dict[str, float], measured_rad: float
+) -> None:
+    check_setpoint(_setpoint(**values), measured_rad, _limits(**limits))
+
+
+@pytest.mark.parametrize(
+    ("values", "limits", "said"),
+    [
+        ({"position_rad": -6.3}, {}, "position -6.3 rad is 6.3 rad from where the joint is"),
+        ({"velocity_rad_s": -5.1}, {"max_speed_rad_s": 0.5}, "5.1 rad/s is over 10 times .*, 0.50 rad/s"),
+        ({"effort_nm": 5.1}, {"max_effort_nm": 0.5}, "5.1 Nm is over 10 times .*, 0.50 Nm"),
+        ({"position_rad": -1.1}, {"min_position_rad": -1.0}, r"position -1.100 rad is outside -1.0 .. None"),
+    ],
+)
+def test_a_setpoint_beyond_a_limit_is_refused_with_both(
+    values: dict[str, float], limits: dict[str, float], said: str
+) -> None:
+    with pytest.raises(WireError, match=said) as refused:
+        check_setpoint(_setpoint(**values), 0.0, _limits(**limits))
+    assert refused.value.reason is Refusal.LIMIT
 
 
 @pytest.mark.parametrize("tick_ns", [1 * MS, 4 * MS, 2_700_001])
@@ -166,6 +248,13 @@ def test_every_motion_that_a_module_takes_fits_a_profile(total_s: float) -> None
     assert period_ns % MS == 0
     profile = effort_profile(np.zeros(max(count, 2)), period_ns)
     assert effort_at(profile, np.array([0.0, total_s])).tolist() == [0.0, 0.0]
+
+
+def test_a_profile_is_no_coarser_than_its_motion_needs() -> None:
+    # 799 periods of 11 ms, and a nanosecond more.
+    assert profile_period_ns(8.789) == 11 * MS
+    assert profile_period_ns(8.789000001) == 12 * MS
+    assert profile_period_ns(7.99) == 10 * MS
 
 
 def test_too_many_efforts_are_refused_with_how_many_there_may_be() -> None:

@@ -268,6 +268,19 @@ def test_a_fault_stays_the_reason_while_an_m_stop_is_pressed() -> None:
     assert "winding" in one.status().note
 
 
+def test_a_module_in_fault_says_so_as_often_while_an_m_stop_is_pressed() -> None:
+    said = []
+    for pressed in (False, True):
+        one = Bench()
+        one.winding_c = 155.0
+        one.tick()
+        one.m_stop = pressed
+        one.published.clear()
+        one.ticks(1000)
+        said.append([sent.leaf for sent in one.published].count(Leaf.STATUS))
+    assert said[0] == said[1] > 0
+
+
 @pytest.mark.parametrize("state", ["fault", "expired"])
 def test_what_led_to_a_state_stays_its_reason_when_its_lease_is_released(state: str) -> None:
     one = Bench()

@@ -350,6 +350,11 @@ def test_without_a_supply_and_with_one_that_reads_below_zero_there_is_no_pwm(pwm
     assert driven(guard(), pwm, reading(voltage_v=0.5))[0] == pytest.approx(some)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_at_more_than_its_nominal_voltage_a_command_is_at_most_one(sign: float) -> None:
+    assert driven(guard(), sign * 3.0, reading(voltage_v=96.0))[0] == sign
+
+
 def test_the_brake_is_bounded_like_any_command() -> None:
     limiter = guard(current_a=0.1)
     sample = reading(speed=-KIND.max_speed_rad_s)

@@ -101,6 +101,36 @@ def test_a_sensor_that_is_bad_time_and_again_is_a_fault_until_it_is_good_for_a_w
     assert (GOOD_PER_BAD, MAX_OWED) == (8, 200)
 
 
+def test_a_bad_sample_is_made_up_for_by_eight_good_ones_from_the_first_one_on() -> None:
+    check = SampleCheck(KIND)
+    check.checked(GOOD._replace(effort_nm=math.nan))
+    for _ in range(GOOD_PER_BAD):
+        assert not check.is_clean
+        check.checked(GOOD)
+    assert check.is_clean
+
+
+def test_only_more_than_is_made_up_for_in_a_while_is_a_loose_contact() -> None:
+    bad = GOOD._replace(effort_nm=math.nan)
+    for many, is_loose in ((MAX_OWED // GOOD_PER_BAD, False), (MAX_OWED // GOOD_PER_BAD + 1, True)):
+        check = SampleCheck(KIND)
+        for _ in range(many):
+            check.checked(bad)
+        assert check.fault
+        check.checked(GOOD)
+        assert bool(check.fault) is is_loose
+    # As many are to come in the end, of which never more than five are bad in a row.
+    check = SampleCheck(KIND)
+    check.checked(GOOD)
+    for good in (2, 2, 2, 1, 1):
+        for _ in range(MAX_HELD):
+            check.checked(bad)
+        for _ in range(good):
+            check.checked(GOOD)
+    check.checked(bad)
+    assert check.fault == ""
+
+
 def test_a_bad_sample_now_and_then_is_none() -> None:
     check = SampleCheck(KIND)
     check.checked(GOOD)
