@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from coordinator.attendant.workspace import load_workspace
 from coordinator.excitation.plan import load_plan
+from coordinator.live_robot.discovery import IS_IT_THERE
 from coordinator.main import app as coordinator
 from module_agent.control.safety_file import read_safety
 from module_agent.main import app as agent
@@ -192,7 +193,7 @@ def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         for word in ("Traceback", "pydantic", "KeyError", "validation error", "errors.py", "NoneType"):
             assert word not in said, where
         # A file is read before anybody is looked for.
-        assert "do its agents run" not in said, where
+        assert IS_IT_THERE not in said, where
         # The parser's own errors begin with how to use the command.
         assert said.startswith("Usage:") or f"{program}: " in said, where
         assert sorted(os.walk(tmp_path)) == before, where

@@ -24,12 +24,13 @@ from xml.etree.ElementTree import (
 
 from pydantic import ValidationError
 
-from module_agent.control.gains import default_gains, for_message, from_message
+from module_agent.control.gains import check_gains, default_gains, for_message, from_message
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
 from module_agent.model.model_faults import first_fault
 from module_agent.wire.messages import GainSet, PidGains
+from module_agent.wire.refusal import WireError
 
 ROOTS = ("group_gains", "gains")
 LOOPS = ("position", "velocity", "effort")
@@ -70,22 +71,17 @@ class GainsFile(NamedTuple):
         """Return the gains for modules that have the `present` ones, in their order.
 
         Raises:
-            GainsFileError: the file is for another number of modules, or their gains cannot be with those of
-                the file.
+            GainsFileError: the file is for another number of modules.
         """
         sets: list[dict[str, Any]] = [one.model_dump() for one in present]
         if self.strategies:
-            for own, strategy in zip(
-                sets, self._each("control_strategy", self.strategies, len(sets)), strict=True
-            ):
+            strategies = self._each("control_strategy", self.strategies, len(sets))
+            for own, strategy in zip(sets, strategies, strict=True):
                 own["strategy"] = strategy
         for (loop, name), values in self.gains.items():
             for own, value in zip(sets, self._each(name, values, len(sets)), strict=True):
                 own[loop][name] = value
-        try:
-            return [GainSet.model_validate(own) for own in sets]
-        except ValidationError as error:
-            raise GainsFileError(f"{self.path}: {first_fault(error)}") from error
+        return [GainSet.model_validate(own) for own in sets]
 
     def _each(self, name: str, values: list[T], modules: int) -> list[T]:
         if len(values) not in (1, modules):
@@ -97,7 +93,8 @@ def read_gains(path: Path) -> GainsFile:
     """Return what a gains file says.
 
     Raises:
-        GainsFileError: no such file, not of this format, or a gain that cannot be.
+        GainsFileError: no such file, not of this format, elements for different numbers of modules, or a
+            gain that no module takes.
     """
     try:
         root = fromstring(path.read_text(encoding="utf-8"), XMLParser(target=_Elements(path)))
@@ -105,20 +102,32 @@ def read_gains(path: Path) -> GainsFile:
         raise GainsFileError(f"{path}: no gains file can be read: {error}") from error
     if root.tag not in ROOTS:
         raise GainsFileError(f"{path}: its root is <{root.tag}>, that of a gains file is <{ROOTS[0]}>")
-    found = GainsFile(path, [], {})
+    strategies: list[int] = []
+    gains: dict[tuple[str, str], list[float | bool]] = {}
     for element in root:
         if element.tag == "control_strategy":
-            found.strategies[:] = [_strategy(path, word) for word in _words(path, element)]
+            strategies = [_strategy(path, word) for word in _words(path, element)]
         elif element.tag in LOOPS:
             for gain in element:
                 values = [_value(path, element.tag, gain.tag, word) for word in _words(path, gain)]
-                found.gains[element.tag, gain.tag] = values
+                gains[element.tag, gain.tag] = values
         else:
             raise GainsFileError(f"{path}: unknown element <{element.tag}>")
-    # What no module takes, and elements for different numbers of modules, are refused before one is asked.
-    modules = max((len(found.strategies), *(len(values) for values in found.gains.values()), 1))
-    found.applied([default_gains(module_type("X5-1"), 3)] * modules)
+    found = GainsFile(path, strategies, gains)
+    _check(found)
     return found
+
+
+def _check(found: GainsFile) -> None:
+    """Check the values with those of any modules, here the factory's: each is checked by itself."""
+    modules = max((len(found.strategies), *(len(values) for values in found.gains.values()), 1))
+    try:
+        for own in found.applied([default_gains(module_type("X5-1"), 3)] * modules):
+            check_gains(own)
+    except ValidationError as error:
+        raise GainsFileError(f"{found.path}: {first_fault(error)}") from error
+    except WireError as error:
+        raise GainsFileError(f"{found.path}: {error}") from error
 
 
 def write_gains(path: Path, gains: Sequence[GainSet]) -> None:

@@ -47,7 +47,7 @@ ROOT = Path(__file__).parents[2]
 LIMIT_S = 90.0
 MARK = "X5_INTEGRATION_TEST"
 # All of these tests over the driver of real modules and what stands in for hebi-py; by default those that
-# take `through_driver` are, once with it and once without.
+# take `through_driver` are, once without it and, as breadth, once with it.
 THROUGH_THE_DRIVER = "X5_TEST_HEBI" in os.environ
 
 # A whole session in 14 s (27 s with dynamics): shorter motions, everything else as shipped.

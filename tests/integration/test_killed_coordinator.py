@@ -12,6 +12,7 @@ from sim.scoring.score import score
 EXPIRED = STATE_NAMES.index("expired")
 
 
+# The test by which `make test` has the processes of the driver.
 @pytest.mark.parametrize("through_driver", [False, True], ids=["loops", "driver"], indirect=True)
 def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(
     launcher, client, through_driver

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -14,10 +14,10 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify
 from coordinator.recording.run_folder import load_recording
 from coordinator.session.run import write_outputs
+from sim.physics.engine import Physics
 from tests.breadth import breadth
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.parametrize("physics", ["compiled", *breadth("pybullet")])
 
 
 def _run(out: Path, plan: Plan, physics: str, seed: int, hash_seed: str) -> str:
@@ -50,6 +50,7 @@ def _without_wall_time(path: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.parametrize("physics", get_args(Physics))
 @pytest.mark.xdist_group("determinism")
 def test_two_processes_with_one_seed_do_the_same_and_another_seed_does_other(
     quick_plan: Plan, tmp_path: Path, physics: str
@@ -63,6 +64,7 @@ def test_two_processes_with_one_seed_do_the_same_and_another_seed_does_other(
     )
 
 
+@pytest.mark.parametrize("physics", ["compiled", *breadth("pybullet")])
 @pytest.mark.parametrize(("robot", "dynamics"), [("thesis_171_vertical", True), ("a2085_03", False)])
 def test_a_replay_of_the_recording_gives_the_same_result(
     rigs: Callable[..., Any], quick_plan: Plan, tmp_path: Path, robot: str, dynamics: bool

@@ -48,7 +48,8 @@ def errors_mm(seed: int, plan: Plan, rate_hz: float | None) -> tuple[float, floa
     return float(np.sqrt(np.mean(np.square(links)))), score.tip_position_rms_mm
 
 
-# One draw of the noise says little of what the driver costs on average; what it breaks shows with one.
+# A fault of the driver shows in a single draw of the noise; what it costs on average takes three. In this one
+# links and tip are alike within 2 %.
 @pytest.mark.parametrize("seeds", [(2,), *breadth(((1, 2, 3),))])
 def test_topology_links_and_tip_are_as_good_as_without_the_driver(
     quick_plan: Plan, seeds: tuple[int, ...]

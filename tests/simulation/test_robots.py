@@ -30,7 +30,7 @@ OTHERS = tuple(name for name in shipped_robots() if name not in THESIS)
 # differ in length and alignment alone and are recognised over a LAN in whole runs: here two of them do.
 POORLY_CONNECTED = ("thesis_171_horizontal", "thesis_484_vertical", *OTHERS)
 WELL_CONNECTED = ("a2085_03", "tree_y")
-# Chains as others are, with more joints: a minute of computing.
+# Chains like others with more joints, which take a minute: `make test-all` has them.
 LONG = ("a2085_06", "snake16")
 # Sixteen joints take long.
 SHORTER = {"settle_s": 0.2, "constant_duration_s": 0.4, "travel_speed_rad_s": 2.5}

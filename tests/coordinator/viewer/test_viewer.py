@@ -336,7 +336,7 @@ def test_a_library_that_hangs_at_the_end_is_given_up_and_named(
     """As it does on some full disks: the run ends all the same, and its process too."""
     gate = threading.Event()
     monkeypatch.setattr("coordinator.viewer.viewer.DISCONNECT_SECONDS", 0.05)
-    # That of the layout ends.
+    # The layout's own stream disconnects as usual.
     file, disconnect = viewer._opened.file, rr.RecordingStream.disconnect
     monkeypatch.setattr(
         rr.RecordingStream, "disconnect", lambda stream: gate.wait() if stream is file else disconnect(stream)

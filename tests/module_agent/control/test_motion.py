@@ -158,16 +158,21 @@ def test_a_motion_that_computes_to_no_number_is_refused(pattern: Any) -> None:
         Motion(pattern, 0.0, 0)
 
 
-@pytest.mark.parametrize("duration_s", [2e-4, 0.4, 59.999])
-def test_a_motion_is_sampled_from_its_start_to_its_end_and_holds_what_comes_last(duration_s: float) -> None:
+@pytest.mark.parametrize(("duration_s", "steps"), [(2e-4, 1), (0.0625, 62), (0.4, 400), (59.999, 59_999)])
+def test_a_motion_is_sampled_every_millisecond_from_its_start_to_its_end(
+    duration_s: float, steps: int
+) -> None:
     motion = Motion(Rest(duration_s=duration_s), 0.3, 7)
-    steps = max(1, round(duration_s * 1e3))
     assert motion.span_ns == (7, 7 + steps * MS)
     assert motion.targets.shape == (3, steps + 1)
-    # It ends before its ramp is over, as no pattern does: the last two samples differ.
-    ramp = Motion(ConstantMotion(velocity_rad_s=1.5, duration_s=0.4, ramp_s=0.0), 0.3, 7, RAMP)
-    assert ramp.last_position_rad == ramp.targets[0, -1] > ramp.targets[0, -2]
-    assert ramp.last_effort_nm == ramp.targets[2, -1]
+
+
+def test_what_comes_last_in_a_motion_is_its_end() -> None:
+    # Without ramps it ends at full speed, and with efforts that still fall.
+    motion = Motion(ConstantMotion(velocity_rad_s=1.5, duration_s=0.15, ramp_s=0.0), 0.3, 7, RAMP)
+    position, _, effort = motion.targets
+    assert motion.last_position_rad == position[-1] > position[-2]
+    assert motion.last_effort_nm == effort[-1] < effort[-2]
 
 
 def test_a_motion_of_a_minute_is_taken_and_no_longer_one() -> None:
@@ -215,9 +220,10 @@ def test_a_setpoint_at_a_limit_is_taken(
         ({"velocity_rad_s": -5.1}, {"max_speed_rad_s": 0.5}, "5.1 rad/s is over 10 times .*, 0.50 rad/s"),
         ({"effort_nm": 5.1}, {"max_effort_nm": 0.5}, "5.1 Nm is over 10 times .*, 0.50 Nm"),
         ({"position_rad": -1.1}, {"min_position_rad": -1.0}, r"position -1.100 rad is outside -1.0 .. None"),
+        ({"position_rad": 1.1}, {"max_position_rad": 1.0}, r"position 1.100 rad is outside None .. 1.0"),
     ],
 )
-def test_a_setpoint_beyond_a_limit_is_refused_with_both(
+def test_a_setpoint_beyond_a_limit_is_refused_with_what_it_asks_and_what_is_allowed(
     values: dict[str, float], limits: dict[str, float], said: str
 ) -> None:
     with pytest.raises(WireError, match=said) as refused:

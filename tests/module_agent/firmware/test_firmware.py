@@ -1092,6 +1092,19 @@ def test_at_the_first_nanoseconds_a_clock_is_a_clock() -> None:
     assert wired.firmware.state == "expired"
 
 
+def test_that_a_lease_ended_is_said_at_once_by_a_clock_that_stands_at_its_zero() -> None:
+    rest = Bench()
+    kind = CATALOGUE["X5-9"]
+    wired = WiredFirmware(FirmwareConfig("A", kind, BOOT, catalogue_limits(kind)))
+    sample = SensorSample(0, 0, *(0.0,) * 6, 40.0, 24.0, *(0.0,) * 6)  # type: ignore[call-arg]
+    acquire = encode(LeaseRequest(**rest.head(action="acquire", token=0, echo_ns=0)))
+    wired.tick(sample, [Incoming(Leaf.LEASE, acquire, None)])
+    assert wired.firmware.state == "armed"
+    _, out = wired.tick(sample)
+    said = [decode(Status, o.payload) for o in out if isinstance(o, Publication) and o.leaf is Leaf.STATUS]
+    assert [(status.state, status.holder) for status in said] == [("expired", None)]
+
+
 @pytest.mark.parametrize("is_hot", [False, True])
 def test_a_clock_before_its_zero_is_said_at_once(is_hot: bool) -> None:
     """Whatever the module was: at a time of 0 no status waits for its turn."""

@@ -101,7 +101,7 @@ def test_a_sensor_that_is_bad_time_and_again_is_a_fault_until_it_is_good_for_a_w
     assert (GOOD_PER_BAD, MAX_OWED) == (8, 200)
 
 
-def test_a_bad_sample_is_made_up_for_by_eight_good_ones_from_the_first_one_on() -> None:
+def test_a_bad_sample_is_made_up_for_by_eight_good_ones_also_before_the_first_good_one() -> None:
     check = SampleCheck(KIND)
     check.checked(GOOD._replace(effort_nm=math.nan))
     for _ in range(GOOD_PER_BAD):
@@ -119,7 +119,7 @@ def test_only_more_than_is_made_up_for_in_a_while_is_a_loose_contact() -> None:
         assert check.fault
         check.checked(GOOD)
         assert bool(check.fault) is is_loose
-    # As many are to come in the end, of which never more than five are bad in a row.
+    # In the end exactly `MAX_OWED` good ones are owed, and never more than five samples were bad in a row.
     check = SampleCheck(KIND)
     check.checked(GOOD)
     for good in (2, 2, 2, 1, 1):
