@@ -44,7 +44,7 @@ from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[2]
 # No test waits this long unless it fails: the machine may be slow and shared.
-LIMIT_S = 90.0
+LIMIT_S = 180.0
 MARK = "X5_INTEGRATION_TEST"
 # All of these tests over the driver of real modules and what stands in for hebi-py; by default those that
 # take `through_driver` are, once without it and, as breadth, once with it.
