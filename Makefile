@@ -18,7 +18,7 @@ help:
 	@echo "make watch   a night: 100 hours of everyday use under the monitor, and changes that grow slowly"
 	@echo "make thesis  the thesis' experiments side by side with what was printed, few trials, under three minutes"
 	@echo "make test    the tests that a merge must pass"
-	@echo "make test-all  these, and further robots, seeds and settings of what they tell; twice as long"
+	@echo "make test-all  these, and further robots, seeds and settings of what they tell; half as long again"
 	@echo "make coverage  branch coverage of what runs in one process"
 	@echo "make safety  branch coverage of the safety core, which must be whole"
 	@echo "make mutants every change of the safety core that its tests do not notice; half an hour, goes on where it stopped"

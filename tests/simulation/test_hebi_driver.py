@@ -17,10 +17,11 @@ from sim.scoring.score import score_identified
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
 from sim.world.truth import Motion, Truth, truth_of
-from tests.breadth import breadth
 from tests.rig import silent
 
 ROBOT = "a2085_04"
+# One draw of the noise says little of either.
+SEEDS = (1, 2)
 # Errors through the driver over those without it.
 MOST = 1.5
 RATE_HZ = 250.0
@@ -48,14 +49,9 @@ def errors_mm(seed: int, plan: Plan, rate_hz: float | None) -> tuple[float, floa
     return float(np.sqrt(np.mean(np.square(links)))), score.tip_position_rms_mm
 
 
-# A fault of the driver shows in a single draw of the noise; what it costs on average takes three. In this one
-# links and tip are alike within 2 %.
-@pytest.mark.parametrize("seeds", [(2,), *breadth(((1, 2, 3),))])
-def test_topology_links_and_tip_are_as_good_as_without_the_driver(
-    quick_plan: Plan, seeds: tuple[int, ...]
-) -> None:
+def test_topology_links_and_tip_are_as_good_as_without_the_driver(quick_plan: Plan) -> None:
     direct, driven = (
-        np.sqrt(np.mean([np.square(errors_mm(seed, quick_plan, rate)) for seed in seeds], axis=0))
+        np.sqrt(np.mean([np.square(errors_mm(seed, quick_plan, rate)) for seed in SEEDS], axis=0))
         for rate in (None, RATE_HZ)
     )
     assert np.all(driven < MOST * direct), f"links and tip {driven} mm, without the driver {direct} mm"
