@@ -4,6 +4,7 @@ Speeds are only worth something on a machine that is otherwise idle; CPU time pe
 be no shorter than the CPU time of all processes over the number of cores.
 """
 
+import math
 import os
 import socket
 import time
@@ -148,13 +149,15 @@ def test_sixteen_modules_in_real_time(tmp_path: Path, endpoint: str, processes: 
 def test_robots_moved_by_a_coordinator_beside_a_bare_barrier(
     tmp_path: Path, modules: int, processes: int, bar: float
 ) -> None:
-    """All joints are held at 1 kHz and move in turn; asked for twice what the bar is, so that it can miss it.
+    """All joints are held at 1 kHz and move in turn; asked for a fifth more than the bar.
 
-    The bare barrier runs before and after, so that both see the same machine.
+    It is not asked for much more, because the modules' clocks are as fast as their world: at three times
+    real time the 250 ms that a command lives are 83 ms for the coordinator, whose keep-alives come every
+    60 ms. The bare barrier runs before and after, so that both see the same machine.
     """
     bares = [measure(tmp_path, processes, modules, BARE_S, free_endpoint())]
     plan = plan_fleet(1, modules, (free_endpoint(),), processes)
-    figures = run_fleet(FleetConfig(plan, tmp_path, MOVED_S, 2.0 * bar, moves=True), lambda text: None)
+    figures = run_fleet(FleetConfig(plan, tmp_path, MOVED_S, 1.2 * bar, moves=True), lambda text: None)
     bares.append(measure(tmp_path, processes, modules, BARE_S, free_endpoint()))
     what = f"{modules} modules in {processes} processes, moved by a coordinator"
     broke = "; ".join(figures.broke) or "nothing"
@@ -167,7 +170,12 @@ def test_robots_moved_by_a_coordinator_beside_a_bare_barrier(
         anchor = f"{ours_us:.1f} us over {min(bares_us):.1f} us"
         over = ours_us / min(bares_us)
         report(f"{what}: CPU of {who} over a bare barrier's", over, at_most=1.5, anchor=anchor)
-    report(f"{what}: motions done", figures.motions, anchor=f"{figures.motions_failed} not")
+    report(
+        f"{what}: motions that did not end",
+        figures.motions_failed if figures.motions else math.nan,
+        at_most=0.0,
+        anchor=f"{figures.motions} did",
+    )
 
 
 def _served_us(figures: FleetFigures) -> float:
