@@ -102,7 +102,7 @@ def load(
     Exit codes: 0 all have them, 1 a module is missing or refuses, 2 wrong usage.
     """
     note = Terminal(at.quiet).note
-    chosen = read_gains(file)
+    chosen = read_gains(file, len(module) if module else None)
     loop = ScaledLoop()
     session = _session(at, loop, expect, module or ())
     loaded = attend(loop, session.load_gains(chosen.applied))

@@ -89,12 +89,16 @@ class GainsFile(NamedTuple):
         return values * modules if len(values) == 1 else values
 
 
-def read_gains(path: Path) -> GainsFile:
+def read_gains(path: Path, modules: int | None = None) -> GainsFile:
     """Return what a gains file says.
 
+    Args:
+        path: the file.
+        modules: for how many modules it has to be, None for any number.
+
     Raises:
-        GainsFileError: no such file, not of this format, elements for different numbers of modules, or a
-            gain that no module takes.
+        GainsFileError: no such file, not of this format, elements for different numbers of modules, or
+            for another number than `modules`, or a gain that no module takes.
     """
     try:
         root = fromstring(path.read_text(encoding="utf-8"), XMLParser(target=_Elements(path)))
@@ -114,13 +118,14 @@ def read_gains(path: Path) -> GainsFile:
         else:
             raise GainsFileError(f"{path}: unknown element <{element.tag}>")
     found = GainsFile(path, strategies, gains)
-    _check(found)
+    _check(found, modules)
     return found
 
 
-def _check(found: GainsFile) -> None:
+def _check(found: GainsFile, modules: int | None) -> None:
     """Check the values with those of any modules, here the factory's: each is checked by itself."""
-    modules = max((len(found.strategies), *(len(values) for values in found.gains.values()), 1))
+    if modules is None:
+        modules = max((len(found.strategies), *(len(values) for values in found.gains.values()), 1))
     try:
         for own in found.applied([default_gains(module_type("X5-1"), 3)] * modules):
             check_gains(own)

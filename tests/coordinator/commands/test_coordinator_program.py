@@ -72,6 +72,16 @@ def test_wrong_usage_is_answered_with_what_is_right_and_nothing_is_made(
     assert not out.exists()
 
 
+def test_a_gains_file_for_another_number_of_modules_is_refused_before_they_are_looked_for(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "three.xml"
+    path.write_text("<group_gains><position><kp>1 2 3</kp></position></group_gains>")
+    done = CliRunner().invoke(app, ["gains", "load", str(path), "--module", "A", "--module", "B"])
+    assert done.exit_code == EXIT_USAGE
+    assert f"{path}: <kp> has 3 values for 2 modules" in done.output
+
+
 def test_a_plan_without_fast_motions_is_refused_before_anything_moves(tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text("topology_only = true\n")
     arguments = ["run", "--out", str(tmp_path / "run"), "--plan", str(tmp_path / "plan.toml")]

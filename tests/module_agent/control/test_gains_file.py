@@ -201,6 +201,8 @@ def test_a_file_for_three_modules_is_refused_by_two(file: Path) -> None:
     file.write_text("<group_gains><position><kp>1 2 3</kp></position></group_gains>")
     with pytest.raises(GainsFileError, match="<kp> has 3 values for 2 modules"):
         read_gains(file).applied(FACTORY)
+    with pytest.raises(GainsFileError, match="<kp> has 3 values for 2 modules"):
+        read_gains(file, modules=2)
 
 
 def test_hebi_py_reads_our_files_and_we_read_its(tmp_path: Path) -> None:
