@@ -43,8 +43,8 @@ PAGES_WITH_COMMANDS = [
     "export.md",
 ]
 SCRIPTS = Path(sys.executable).parent
-# What a first-time user waits for at most; each of these takes well under a minute on two cores.
-PATIENCE_S = 240
+# No test waits this long unless it fails; each command takes well under a minute on two cores of their own.
+PATIENCE_S = 900
 # What is added to commands of pages to run them in small form; the last one of an option counts. CI runs the
 # benchmarks and a whole run as they are.
 SHORTER = {
@@ -53,7 +53,9 @@ SHORTER = {
     "x5-coordinator excite": ("--tries", "30"),
     "x5-sim benchmark kinematics": ("--trials", "1"),
     "x5-sim benchmark dynamics": ("--only", "regressor"),
-    "x5-sim watch": ("--hours", "0.005", "--trials", "0"),
+    # Eighteen seconds of each robot, kept in one folder: no command lives again what one before it has lived.
+    "x5-sim watch --robot": ("--hours", "0.005", "--trials", "0", "--out", "runs/watch"),
+    "x5-sim watch --hours": ("--hours", "0.01", "--trials", "0", "--out", "runs/watch"),
 }
 SHORTER_PLAN = """
 discover_s = 0.5
@@ -65,6 +67,8 @@ sine_centre_s = 1.2
 sine_sigma_s = 0.5
 dynamic_repeats = 1
 simultaneous_duration_s = 6.0
+# On a machine that is busy with other things a keep-alive may come too late; that is tried again.
+retries = 5
 """
 
 
@@ -84,7 +88,7 @@ def background() -> Iterator[list["subprocess.Popen[bytes]"]]:
     for process in reversed(started):
         process.send_signal(signal.SIGTERM)
     for process in reversed(started):
-        assert process.wait(30) == 0, f"{process.args!r} ended with {process.returncode}"
+        assert process.wait(120) == 0, f"{process.args!r} ended with {process.returncode}"
 
 
 def environment() -> dict[str, str]:
