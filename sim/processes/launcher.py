@@ -24,7 +24,8 @@ from sim.robot.noise_choice import NoiseChoice
 
 # A first start without `x5-sim compile` compiles for over a minute.
 START_TIMEOUT_S = 240.0
-STOP_TIMEOUT_S = 5.0
+# A world writes its truth before it ends.
+STOP_TIMEOUT_S = 20.0
 WATCH_S = 0.1
 LOGS = "logs"
 SAFETY = "safety.toml"
