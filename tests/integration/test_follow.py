@@ -22,7 +22,7 @@ def follow(launcher, known_folder, tmp_path):
     moving = robot.config.serials[0]
     path = tmp_path / "motion.csv"
     swing = [0.0, 0.0, 0.01, 0.03, 0.06, 0.08, 0.09, 0.09]
-    path.write_text("\n".join([f"t_s,q_{moving}_rad", *(f"{k / 8},{q}" for k, q in enumerate(swing))]) + "\n")
+    path.write_text("\n".join([f"t_s,q_{moving}_rad", *(f"{k / 4},{q}" for k, q in enumerate(swing))]) + "\n")
     started = []
 
     def start(*options: str, **known: object) -> "subprocess.Popen[str]":

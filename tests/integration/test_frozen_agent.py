@@ -8,7 +8,7 @@ import pytest
 
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
-from module_agent.wire.messages import MotionCommand
+from module_agent.wire.messages import MotionCommand, Status
 from sim.world.truth import read_motion
 
 HELD_RAD, ASKED_RAD = 0.3, 1.8
@@ -33,8 +33,16 @@ def test_nothing_that_was_sent_to_a_frozen_agent_is_executed_when_it_thaws(
     commander.meet(robot.config.serials, frozen)
     commander.acquire(serial)
     commander.ramp(serial, 0.0, HELD_RAD)
-    before = commander.status(serial)
-    assert before.refusals.get("stale", 0) == 0
+
+    def held() -> Status | None:
+        status: Status = commander.status(serial)
+        if status.state == "streaming":
+            return status
+        commander.acquire(serial)
+        commander.ramp(serial, HELD_RAD, HELD_RAD)
+        return None
+
+    before = commander.until(held, "the hold", frozen)
 
     frozen.process.send_signal(signal.SIGSTOP)
     frozen_ns, sent = commander.newest_ns[serial], 0
@@ -60,8 +68,9 @@ def test_nothing_that_was_sent_to_a_frozen_agent_is_executed_when_it_thaws(
         # Streams on, now with fresh echoes: what has expired must be armed anew before it moves.
         commander.stream(serial, ASKED_RAD)
         refusals = commander.status(serial).refusals
-        arrived = refusals.get("stale", 0) >= sent
-        return refusals.get("not_armed", 0) >= 10 and (arrived or commander.losses[serial] > 0)
+        arrived = refusals.get("stale", 0) - before.refusals.get("stale", 0) >= sent
+        not_armed = refusals.get("not_armed", 0) - before.refusals.get("not_armed", 0)
+        return not_armed >= 10 and (arrived or commander.losses[serial] > 0)
 
     commander.until(refused, "the refusals", frozen)
     # A machine that stalls in the short freeze may have let the hub's lease run out as well.

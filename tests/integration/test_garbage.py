@@ -44,7 +44,11 @@ def not_finite() -> dict[Leaf, dict[str, Any]]:
 
 
 def grown(commander, serials: tuple[str, ...], before: dict[str, Counter[str]]) -> dict[str, Counter[str]]:
-    return {s: Counter(commander.status(s).refusals) - before[s] for s in serials}
+    """Return how often each module has refused something since then, keep-alives that came late left out."""
+    since = {s: Counter(commander.status(s).refusals) - before[s] for s in serials}
+    return {
+        s: Counter({why: n for why, n in counts.items() if why != "stale"}) for s, counts in since.items()
+    }
 
 
 def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(

@@ -62,9 +62,9 @@ def resident_mb(pid: int) -> float:
     return 1e-6 * pages * resource.getpagesize()
 
 
-def start_hub(robot, programs) -> Any:
+def start_hub(robot, programs, *options: str) -> Any:
     """Start a coordinator and wait for its hub, or a `list` that is faster is the hub until it has ended."""
-    coordinator = robot.start_coordinator(quiet=True)
+    coordinator = robot.start_coordinator(list(options), quiet=True)
     programs.until(lambda: "discovering modules" in programs.words(coordinator), "a hub", coordinator)
     return coordinator
 
@@ -108,8 +108,8 @@ def test_what_is_published_lets_nobody_act_in_the_holders_name(launcher, client,
     """
     robot = launcher(ROBOT)
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
     agents = robot.start_agents()
+    coordinator = robot.start_coordinator(quiet=True)
     intruder = client(ROBOT)
     serial = robot.config.serials[0]
     poisoner = Intruder(intruder.transport, ROBOT, serial, 0, 1)
@@ -161,13 +161,13 @@ def answer_stops(session: zenoh.Session, statuses: dict[str, list[Status]]) -> l
 
 
 def test_a_stop_reaches_the_modules_past_one_who_answers_in_their_place(
-    launcher, client, programs, endpoint
+    launcher, client, programs, endpoint, lasting_plan
 ) -> None:
     """Without any security: whose answer comes first is nobody's to say, but the motors are stopped."""
     robot = launcher(ROBOT)
     robot.start_world()
-    coordinator = robot.start_coordinator(["--dynamics"], quiet=True)
     agents = robot.start_agents()
+    coordinator = robot.start_coordinator(["--plan", str(lasting_plan)], quiet=True)
     ear = client(ROBOT)
     ear.motion(robot.config.serials[0], "windowed_sine", 50, coordinator)
     config = zenoh.Config()
@@ -229,8 +229,8 @@ def test_without_security_false_rows_become_those_of_the_module(launcher, client
     """The positive control of the next test: the rows are well formed, and the coordinator believes them."""
     robot = launcher(ROBOT)
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
     robot.start_agents()
+    coordinator = robot.start_coordinator(quiet=True)
     intruder = client(ROBOT)
     serial = robot.config.serials[0]
     forger = Forger(intruder.transport, serial)
@@ -265,7 +265,7 @@ def lie(module, status: bytes) -> None:
 
 
 def test_with_security_the_robot_identifies_itself_among_intruders(
-    secured, programs, endpoint, tmp_path
+    secured, programs, endpoint, plan, tmp_path
 ) -> None:
     """An observer and a hostile module with a certificate attack all the time; nothing of it arrives.
 
@@ -275,8 +275,12 @@ def test_with_security_the_robot_identifies_itself_among_intruders(
     robot, folder = secured
     serial = robot.config.serials[0]
     robot.start_world()
-    coordinator = start_hub(robot, programs)
+    # Agents wait for the hub as long as it takes; the hub waits for them for ten seconds only.
     agents = robot.start_agents()
+    # The session lasts until all who attack have come.
+    longer = tmp_path / "longer.toml"
+    longer.write_text(plan.read_text().replace("sine_centre_s = 1.4", "sine_centre_s = 6.0"))
+    coordinator = start_hub(robot, programs, "--plan", str(longer))
     programs.until(
         lambda: list_modules(programs, endpoint, folder).returncode == 0, "the modules", coordinator
     )
@@ -333,12 +337,14 @@ def test_with_security_the_robot_identifies_itself_among_intruders(
     assert not [entry for entry in recorded if entry.payload == GARBAGE or "GHOST" in entry.topic]
 
 
-def test_anyone_of_the_fleet_stops_the_robot_and_nobody_else(secured, programs, endpoint, client) -> None:
+def test_anyone_of_the_fleet_stops_the_robot_and_nobody_else(
+    secured, programs, endpoint, client, lasting_plan
+) -> None:
     robot, folder = secured
     serial = robot.config.serials[0]
     robot.start_world()
-    coordinator = start_hub(robot, programs)
     robot.start_agents()
+    coordinator = start_hub(robot, programs, "--plan", str(lasting_plan))
     observer = folder.parent / "observer"
     observer.mkdir()
     for name in ("fleet.toml", "authority.pem", "observer.pem", "observer.key"):

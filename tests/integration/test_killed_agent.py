@@ -8,8 +8,8 @@ def test_a_killed_agent_is_named_and_what_it_did_until_then_is_kept(launcher, cl
     config = robot.config
     victim, survivor = reversed(config.serials)
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
     agents = dict(zip(config.serials, robot.start_agents(), strict=True))
+    coordinator = robot.start_coordinator(quiet=True)
     ear = client(config.robot_name)
     motion = ear.motion(victim, "windowed_sine", 100, coordinator)
     agents[victim].process.kill()

@@ -7,15 +7,29 @@ from coordinator.live_robot.commander import KEEP_ALIVE_S, LEASE_NS
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 from module_agent.wire.feedback_rows import STATE_NAMES
+from module_agent.wire.messages import Status
 from sim.scoring.score import score
 
 EXPIRED = STATE_NAMES.index("expired")
+# Four seconds: a motion that lasts grows slowly.
+MOVING_ROWS = 1000
+
+
+def last_expiry(statuses: list[Status]) -> Status | None:
+    """Return the first status of the expiry that a module is in, None if it is in none.
+
+    A busy machine may have held up keep-alives before: the session re-arms then and tries again.
+    """
+    newest = statuses[-1]
+    if newest.state != "expired":
+        return None
+    return next(s for s in statuses if s.state == "expired" and s.expiries == newest.expiries)
 
 
 # The test by which `make test` has the processes of the driver.
 @pytest.mark.parametrize("through_driver", [False, True], ids=["loops", "driver"], indirect=True)
 def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(
-    launcher, client, through_driver
+    launcher, client, lasting_plan, through_driver
 ) -> None:
     """The hub outlives the coordinator here, so that the instant of the last accepted command is heard."""
     robot = launcher(lifetime_ms=500, hebi=through_driver)
@@ -23,17 +37,15 @@ def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(
     ear = client(config.robot_name, hub=True)
     robot.start_world()
     agents = robot.start_agents()
-    coordinator = robot.start_coordinator(quiet=True)
+    coordinator = robot.start_coordinator(["--plan", str(lasting_plan)], quiet=True)
     mover = config.serials[0]
-    motion = ear.motion(mover, "windowed_sine", 150, coordinator)
+    motion = ear.motion(mover, "windowed_sine", MOVING_ROWS, coordinator)
     coordinator.process.kill()
     coordinator.process.wait()
     for serial in config.serials:
         info = ear.info(serial)
         expired = ear.until(
-            lambda serial=serial: next((s for s in ear.statuses[serial] if s.state == "expired"), None),
-            f"{serial} expired",
-            *agents,
+            lambda serial=serial: last_expiry(ear.statuses[serial]), f"{serial} expired", *agents
         )
         # A keep-alive lets the lease run for this long from the instant at which it is accepted. While
         # answers come late, the motion is commanded again between two of them, which extends no lease.
@@ -43,14 +55,17 @@ def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(
             lambda serial=serial, end=late_ns: ear.newest_ns[serial] > end + 200_000_000, "rows", *agents
         )
         now = ear.status(serial)
-        assert now.expiries == 1
-        rows = ear.history(serial, motion.start_row if serial == mover else 0, now.next_row)
+        assert now.expiries == expired.expiries
+        rows = ear.history(
+            serial, motion.start_row if serial == mover else max(0, now.next_row - 2000), now.next_row
+        )
         past = rows[rows["t_ns"] > late_ns]
         assert len(past)
         assert (past["state"] == EXPIRED).all()
         assert (past["pwm"] == 0.0).all()
-    moving = ear.history(mover, motion.start_row, motion.start_row + 150)
+    moving = ear.history(mover, motion.start_row, motion.start_row + MOVING_ROWS)
     assert np.abs(moving["pwm"]).max() > 0.0
+    assert np.ptp(moving["position_rad"]) > 0.05
     assert ear.status(mover).motion.outcome == "expired"
 
 
@@ -63,8 +78,8 @@ def test_a_killed_coordinator_s_run_is_resumed_where_it_was(launcher, client, pr
     config = robot.config
     first, second = config.serials
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
     agents = robot.start_agents()
+    coordinator = robot.start_coordinator(quiet=True)
     ear = client(config.robot_name)
     motion = ear.motion(second, "windowed_sine", 150, coordinator)
     # A busy machine may have held up the keep-alives before: the session re-arms then and tries again.

@@ -15,8 +15,8 @@ def test_no_row_is_missing_when_the_network_drops_feedback(launcher, programs) -
     robot = launcher(network="lossy")
     config = robot.config
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
     robot.start_agents()
+    coordinator = robot.start_coordinator(quiet=True)
     code, said = programs.ended(coordinator)
     assert code == 0, said
     robot.stop()

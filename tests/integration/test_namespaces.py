@@ -103,8 +103,8 @@ def test_a_robot_whose_modules_are_hosts_of_their_own_recognises_itself_over_lin
     )
     with Launcher(config, lambda text: None) as launcher:
         launcher.start_world()
-        coordinator = launcher.start_coordinator(quiet=True)
         launcher.start_agents()
+        coordinator = launcher.start_coordinator(quiet=True)
         code, said = programs.ended(coordinator)
         assert code == 0, said
     again = [hosts.retransmitted(host) for host in range(len(hosts.namespaces))]

@@ -40,14 +40,14 @@ def test_ctrl_c_stops_everything_and_keeps_what_was_recorded(
 
 
 def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
-    launcher, client, programs, through_driver
+    launcher, client, programs, lasting_plan, through_driver
 ) -> None:
     robot = launcher(hebi=through_driver)
     config = robot.config
     robot.start_world()
-    # A long session: it must not come to its end by itself before it is stopped.
-    coordinator = robot.start_coordinator(["--dynamics"], quiet=True)
     agents = robot.start_agents()
+    # A long session: it must not come to its end by itself before it is stopped.
+    coordinator = robot.start_coordinator(["--plan", str(lasting_plan)], quiet=True)
     ear = client(config.robot_name)
     ear.motion(config.serials[0], "windowed_sine", 50, coordinator)
     where = ("--robot", config.robot_name, "--listen", config.endpoint)

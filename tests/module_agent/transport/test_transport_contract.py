@@ -255,7 +255,7 @@ def test_an_unanswered_query_times_out_once_and_a_late_answer_is_ignored(rig: Ri
     rig.b.serve("k", held.append)  # type: ignore[arg-type]
     rig.settle()
     rig.a.query("k", b"", 0.1, got.append, 9)
-    rig.until(lambda: bool(got))
+    rig.until(lambda: bool(got and held))
     assert len(held) == 1
     held[0].reply(b"too late")
     rig.flush(rig.b, rig.a)

@@ -19,7 +19,7 @@ from module_agent.transport.zenoh_transport import ZenohConfig, ZenohTransport, 
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[3]
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 
 HUB = """
 import sys
