@@ -99,7 +99,9 @@ def loses_last(launcher, client, programs, attend, tmp_path: Path):
     *others, last = robot.config.serials
     robot.start_agent(others)
     victim = robot.start_agent([last], 1)
-    options = ("--may-move", "--workspace", str(room))
+    patient = tmp_path / "patient.toml"
+    patient.write_text("retries = 5\n")
+    options = ("--may-move", "--workspace", str(room), "--plan", str(patient))
     attendant = attend(known_by_run(ARM, tmp_path / "known"), robot.config.endpoint, *options)
     programs.until(lambda: attendant.said(f"attends {ARM}, version 1"), "the attendant")
     ear = client(ARM)
