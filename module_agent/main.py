@@ -63,6 +63,23 @@ def _stop(number: int, _frame: FrameType | None) -> None:
     raise Stopped({signal.SIGTERM: 0, signal.SIGINT: 130}.get(signal.Signals(number), 128 + number))
 
 
+@contextmanager
+def _signals_later() -> Iterator[None]:
+    """Let a signal end the program when this is over, and not before.
+
+    Machine code is loaded with callbacks from C to Python. What a signal raises in one of them is printed and
+    lost, and the program would go on.
+    """
+    came: list[int] = []
+    _handle_signals(lambda number, _frame: came.append(number))
+    try:
+        yield
+    finally:
+        _handle_signals(_stop)
+        if came:
+            _stop(came[0], None)
+
+
 def _transport(
     connect: list[str],
     listen: list[str],
@@ -253,7 +270,9 @@ def _run(
                 modules = LoopInside(BusClient(source.path, source.serials), source.limits)
                 opened.callback(modules.close)
             configs = [config_of(module, secrets.randbits(64), **settings) for module in modules.information]
-            host = AgentHost(robot, modules, transport, configs, worker := ThreadWorker())
+            opened.callback((worker := ThreadWorker()).close)
+            with _signals_later():
+                host = AgentHost(robot, modules, transport, configs, worker)
         opened.pop_all()
     _serve(host, worker)
 

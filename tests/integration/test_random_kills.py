@@ -24,6 +24,8 @@ KILLS, SPEED = int(os.environ.get("X5_KILLS", "2")), float(os.environ.get("X5_KI
 VICTIMS = ("coordinator", "agent", "world", "launcher")
 # A recording with the short plan takes some twelve seconds.
 LATEST_S = 11.0
+# What an agent says of a world that has been killed.
+ENDS = "the modules are gone", "no world listens on", "does not welcome this agent"
 
 
 def launch(robot: Launcher, log: Path) -> Child:
@@ -81,10 +83,9 @@ def check_robot(robot: Launcher) -> None:
     (link,) = found.links
     assert link.link_length_error_mm is not None
     assert link.link_length_sigma_mm is not None
-    # Within the claim, and no claim that says nothing.
-    assert (
-        abs(link.link_length_error_mm) <= 5.0 * link.link_length_sigma_mm <= 0.05 * link.link_length_true_mm
-    )
+    # Within the claim, and the claim within twice what the short plan claims of this link, 1.7 mm.
+    assert abs(link.link_length_error_mm) <= 5.0 * link.link_length_sigma_mm
+    assert link.link_length_sigma_mm <= 0.02 * link.link_length_true_mm
     check_logs(robot)
 
 
@@ -121,8 +122,8 @@ def test_a_random_kill_has_a_named_end_and_the_run_resumes(
             for agent in agents:
                 code, words = programs.ended(agent)
                 assert code == EXIT_LOST, words
-                # On a busy machine the world may be killed before an agent has found it.
-                assert "the modules are gone" in words or "no world listens on" in words
+                # On a busy machine the world may be killed before an agent has found it, or as it comes.
+                assert any(end in words for end in ENDS), words
             left = set()
         else:
             # Modules outlive their coordinator and one another: motors off, they wait for the next one.

@@ -1,5 +1,6 @@
 """What `x5-agent` says when it cannot work; only a hub that is not there yet is waited for."""
 
+import ctypes
 import os
 import signal
 import socket
@@ -126,6 +127,33 @@ def test_an_agent_waits_for_its_hub_until_it_is_told_to_stop(tmp_path: Path) -> 
         agent.send_signal(signal.SIGTERM)
         assert agent.wait(30.0) == 0
         assert agent.stderr.read() == ""
+
+
+def test_a_signal_that_comes_while_machine_code_is_loaded_ends_the_agent_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is raised in a callback from C to Python, as the compiler has, is lost."""
+    lost: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", lost.append)
+    signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = {number: signal.getsignal(number) for number in signals}
+    loaded: list[bool] = []
+
+    def load() -> None:
+        with agent_program._signals_later():
+            ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+            loaded.append(True)
+
+    try:
+        with pytest.raises(agent_program.Stopped) as stopped:
+            load()
+        assert {signal.getsignal(number) for number in signals} == {signal.SIG_IGN}
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert loaded
+    assert stopped.value.code == 0
+    assert not lost
 
 
 @pytest.mark.parametrize(
