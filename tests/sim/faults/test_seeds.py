@@ -53,6 +53,11 @@ def test_a_session_that_violated_something_once_does_not_any_more(
     assert run_seed(one, shrinks=False).violations == {}
 
 
+def test_a_second_module_of_one_serial_is_named_where_motions_are_designed_by_the_first_ones() -> None:
+    """The motion that the next ones would be designed by has no rows: the second module never made it."""
+    assert run_seed(draw(801297), shrinks=False).violations == {}
+
+
 def test_where_the_fit_leaves_a_module_out_no_agent_is_asked_about_its_motions(tmp_path: Path) -> None:
     """A joint is held in its slow motion and later; the module that it carries contradicts all others."""
     stall = Fault("motor stall", 7.939, math.inf, 1, 0.553)
