@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -138,15 +139,24 @@ def test_a_signal_that_comes_while_machine_code_is_loaded_ends_the_agent_after_i
     signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     before = {number: signal.getsignal(number) for number in signals}
     loaded: list[bool] = []
+    closed: list[str] = []
 
-    def load() -> None:
-        with agent_program._signals_later():
+    class Host:
+        def __init__(self, *_: object) -> None:
             ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
             loaded.append(True)
 
+    modules = SimpleNamespace(information=(), close=lambda: closed.append("modules"))
+    transport: Any = SimpleNamespace(close=lambda: closed.append("transport"))
+    monkeypatch.setattr("module_agent.host.AgentHost", Host)
+    monkeypatch.setattr(agent_program, "BusClient", lambda *_: None)
+    monkeypatch.setattr(agent_program, "LoopInside", lambda *_: modules)
+    for target, name in ((agent_program, "_settle"), (sys, "setswitchinterval")):
+        monkeypatch.setattr(target, name, lambda *_: None)
+
     try:
         with pytest.raises(agent_program.Stopped) as stopped:
-            load()
+            agent_program._run("arm", agent_program._OnBus("bus", ("A",), {}), lambda _: transport, {})
         assert {signal.getsignal(number) for number in signals} == {signal.SIG_IGN}
     finally:
         for number, handler in before.items():
@@ -154,6 +164,8 @@ def test_a_signal_that_comes_while_machine_code_is_loaded_ends_the_agent_after_i
     assert loaded
     assert stopped.value.code == 0
     assert not lost
+    # The world waits for nobody who has gone.
+    assert closed == ["modules", "transport"]
 
 
 @pytest.mark.parametrize(
