@@ -155,10 +155,12 @@ class MotionChoice:
 
     def _moved_limits(self, serial: str, slow: MotionRecord) -> JointLimits:
         rows = self._recording.rows(serial, slow.start_row, slow.end_row or slow.start_row)
-        if len(rows) < 2:
-            # Another module answers to this serial and has not made the motion: the session finds that out.
+        t_ns = rows["t_ns"].astype(np.int64)
+        if len(rows) < 2 or t_ns[-1] <= t_ns[0]:
+            # Another module answers to this serial and has not made the motion, or its clock stood or went
+            # back: the session finds that out.
             return self._unmoved_limits(serial)
-        rate_hz = 1e9 * (len(rows) - 1) / float(rows["t_ns"][-1] - rows["t_ns"][0])
+        rate_hz = 1e9 * (len(rows) - 1) / float(t_ns[-1] - t_ns[0])
         load = measured_load(rows["position_rad"].astype(float), rows["effort_nm"].astype(float), rate_hz)
         return self._limits(serial, load.at_most_kg_m2)
 

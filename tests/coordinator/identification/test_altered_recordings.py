@@ -1,6 +1,7 @@
 """Recordings with altered sensors, made by a virtual run: what is wrong is named, or the claim covers it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +210,20 @@ def test_a_sick_module_is_named_and_the_robot_identified_without_it(run: list[En
     # The link between the others is as it would be without the elbow, and its claim holds.
     assert found.result.serials == [YAW, LIFT]
     _covered(found.kinematics)
+
+
+def test_a_link_that_turned_and_has_no_length_makes_the_robot_suspect(run: list[Entry]) -> None:
+    """The elbow's IMU may be anywhere, by residuals that leave nothing: its lift turned it nevertheless."""
+    found = identify_kinematics(_altered(run, lambda *_: None))
+    assert found.suspicions == []
+    estimate = found.fit
+    elbow = found.topology.serials.index(ELBOW)
+    anywhere = np.zeros((len(estimate.covariance), 3))
+    anywhere[6 * elbow + 3 : 6 * elbow + 6] = np.eye(3)
+    lost = replace(estimate, null_basis=anywhere)
+    vague = found._replace(refinement=found.refinement._replace(estimate=lost))
+    (why,) = vague.suspicions
+    assert f"the length of the link {LIFT} - {ELBOW} is not known" in why
 
 
 def _held_back(run: list[Entry], serial: str) -> list[Entry]:

@@ -131,3 +131,18 @@ def test_simultaneous_motions_exist_for_any_load() -> None:
     easy = choice(Plan(mode="simultaneous"), RecordedJoint(0.1), "X5-1").simultaneous()
     for serial in SERIALS:
         assert strained[serial].sines[1].amplitude_rad <= easy[serial].sines[1].amplitude_rad
+
+
+def test_a_clock_that_stood_in_the_slow_motion_leaves_the_load_at_what_is_likely() -> None:
+    class Stood(RecordedJoint):
+        def rows(self, serial: str, first: int, end: int) -> "np.ndarray[Any, Any]":
+            rows = super().rows(serial, first, end)
+            if first == SLOW[0]:
+                rows["t_ns"] = 1_000_000_000
+            return rows
+
+    plan = Plan(motions="optimised", imu="calibrated")
+    slow = choice(plan, RecordedJoint(3.0)).slow("A")
+    fast = choice(plan, Stood(3.0, slow)).fast("A", record(slow, SLOW))
+    unmeasured = choice(plan, RecordedJoint(3.0)).fast("A", record(slow, (SLOW[0], SLOW[0] + 1)))
+    assert fast == unmeasured != fast_of(3.0, plan)

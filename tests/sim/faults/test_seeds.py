@@ -58,6 +58,12 @@ def test_a_second_module_of_one_serial_is_named_where_motions_are_designed_by_th
     assert run_seed(draw(801297), shrinks=False).violations == {}
 
 
+def test_a_clock_that_stood_before_the_motion_that_counts_is_named() -> None:
+    """The motion was made once more after it, so that only round trips show the step."""
+    found = run_seed(draw(801394), shrinks=False)
+    assert (found.violations, found.named_rightly) == ({}, True)
+
+
 def test_where_the_fit_leaves_a_module_out_no_agent_is_asked_about_its_motions(tmp_path: Path) -> None:
     """A joint is held in its slow motion and later; the module that it carries contradicts all others."""
     stall = Fault("motor stall", 7.939, math.inf, 1, 0.553)
