@@ -137,13 +137,18 @@ class PairPart(Part):
 
 
 class DhRowPart(Part):
-    """One joint's parameters (thesis eq. 2); `theta_rad` is added to the joint's position."""
+    """One joint's parameters (thesis eq. 2); `theta_rad` is added to the joint's position.
+
+    beta_rad: Hayati's, a last turn about y, where the next axis is nearly parallel; 0 in older results, whose
+    d_m and a_m are large then.
+    """
 
     serial: str
     theta_rad: float
     d_m: float
     a_m: float
     alpha_rad: float
+    beta_rad: float = 0.0
 
 
 class DhPart(Part):

@@ -10,22 +10,26 @@ from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import body_displacements
 
 
-def dh_transform(theta_rad: np.ndarray, d_m: float, a_m: float, alpha_rad: float) -> np.ndarray:
-    """Eq. 2 for (m,) joint angles: (m, 4, 4) poses of frame i in frame i - 1."""
+def dh_transform(
+    theta_rad: np.ndarray, d_m: float, a_m: float, alpha_rad: float, beta_rad: float = 0.0
+) -> np.ndarray:
+    """Eq. 2, and Hayati's turn about y, for (m,) joint angles: (m, 4, 4) poses of frame i in frame i - 1."""
     c, s, ca, sa = np.cos(theta_rad), np.sin(theta_rad), np.cos(alpha_rad), np.sin(alpha_rad)
     poses = np.zeros((len(theta_rad), 4, 4))
     poses[:, 0] = np.stack([c, -s * ca, s * sa, a_m * c], axis=1)
     poses[:, 1] = np.stack([s, c * ca, -c * sa, a_m * s], axis=1)
     poses[:, 2] = [0.0, sa, ca, d_m]
     poses[:, 3, 3] = 1.0
-    return poses
+    cb, sb = np.cos(beta_rad), np.sin(beta_rad)
+    about_y = np.array([[cb, 0.0, sb, 0.0], [0.0, 1.0, 0.0, 0.0], [-sb, 0.0, cb, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return poses @ about_y
 
 
 def dh_poses(path: DhPath, q: np.ndarray) -> np.ndarray:
     """The pose of the last frame in the root frame, (m, 4, 4), at positions (m, joints of the path)."""
     pose = np.broadcast_to(path.base, (len(q), 4, 4))
     for i, row in enumerate(path.rows):
-        pose = pose @ dh_transform(row.theta_rad + q[:, i], row.d_m, row.a_m, row.alpha_rad)
+        pose = pose @ dh_transform(row.theta_rad + q[:, i], *row[2:])
     return pose
 
 
@@ -75,6 +79,14 @@ def test_the_tables_of_a_random_tree_move_every_leaf_as_its_screws_do(robots: An
         ),  # one line, then meeting
         ([[1, 0, 0], [0, 1, 0]], [[0, 0, 0], [0.1, 0, 0.3]]),  # the first axis along the root's x
         ([[0, 0, 1], [1e-4, 0, 1]], [[0, 0, 0], [0.3, 0.1, 0]]),  # all but parallel
+        (
+            [[0, 0, 1], [0.02, 0.03, -1], [0, 1, 0]],
+            [[0, 0, 0], [0.3, 0.1, 0], [0.5, 0, 0]],
+        ),  # all but opposite
+        (
+            [[0, 0, 1], [0.05, 0, 1], [0, 0, 1]],
+            [[0, 0, 0], [0, 0, 0], [0.2, 0, 0]],
+        ),  # meeting, all but parallel
     ],
 )
 def test_parallel_meeting_and_coinciding_axes_have_tables_too(
@@ -84,6 +96,22 @@ def test_parallel_meeting_and_coinciding_axes_have_tables_too(
     q = np.random.default_rng(3).uniform(-3, 3, (5, len(axes)))
     path = dh_path(chain, len(axes) - 1)
     np.testing.assert_allclose(displaced(chain, path, q), body_displacements(chain, q)[:, -1], atol=1e-9)
+
+
+def test_noise_of_parallel_axes_leaves_their_rows_where_they_are() -> None:
+    """Two milliradians put the common normal of axes 0.3 m apart more than a hundred metres away."""
+    rng = np.random.default_rng(5)
+    ideal = [[0, 0, 0], [0.3, 0, 0.05], [0.3, 0.2, 0.1]]
+    known = dh_path(straight([[0, 0, 1]] * 3, ideal), 2)
+    for _ in range(20):
+        tilted = [[*rng.normal(0.0, 2e-3, 2), 1.0] for _ in range(3)]
+        noisy = dh_path(straight(tilted, ideal), 2)
+        assert [row.d_m for row in noisy.rows] == [0.0, 0.0, 0.0]
+        np.testing.assert_allclose(
+            np.array([row[1:] for row in noisy.rows]), [row[1:] for row in known.rows], atol=2e-2
+        )
+        lengths = [row.a_m for row in noisy.rows]
+        assert lengths == pytest.approx([row.a_m for row in known.rows], abs=2e-3)
 
 
 def test_a_planar_arm_has_its_link_lengths_and_nothing_else() -> None:
