@@ -87,15 +87,15 @@ class Kinematics(NamedTuple):
     @property
     def own_suspicions(self) -> list[str]:
         """The suspicions of this recording, without those of earlier ones."""
-        sick = (one.summary for one in self.findings if one.serious)
-        return [*sick, *self.missing, *self._unknown_lengths, *self.damage]
+        known = [*(one.summary for one in self.findings if one.serious), *self.missing]
+        return [*(known or self._unknown_lengths), *self.damage]
 
     @property
     def _unknown_lengths(self) -> list[str]:
-        """What is to be said of links of whose length the motions told nothing.
+        """What is to be said of links of whose length the motions told nothing, where nothing else says why.
 
-        In the forest all modules stand on joints that moved. Every rotation of a joint shows how far from its
-        axis an IMU is, unless sensors or clocks are so sick that the claim is widened until nothing is left.
+        In the forest all modules stand on joints that moved. A motion shows how far from its axis an IMU is
+        unless it is small and slow, or what it leaves unexplained widens the claim until nothing is left.
         """
         chain = self.fit.chain
         lines = []
@@ -103,8 +103,8 @@ class Kinematics(NamedTuple):
             joint, carried = chain.serials[chain.parent[k]], chain.serials[k]
             if not np.isfinite(self.fit.link_length_sigma_m[k]):
                 lines.append(
-                    f"the length of the link {joint} - {carried} is not known, although {joint} turned it: "
-                    "the residuals of its motions are too large; check the sensors and clocks of both"
+                    f"the length of the link {joint} - {carried} is not known, although {joint} moved: "
+                    "move it farther or faster, and check the sensors and clocks of both"
                 )
         return lines
 

@@ -16,7 +16,8 @@ from scipy.special import erf
 
 from coordinator.identification.finding import UNUSABLE, Finding, Sickness, motion_of
 from coordinator.recording.journal import JournalEvent
-from coordinator.recording.recording import ModuleRecord, Recording, RoundTrip
+from coordinator.recording.recording import ModuleRecord, Recording
+from coordinator.synchronisation.clock_steps import LEAP_NS, leapt, stood_ns
 from module_agent.model.catalogue import GRAVITY_M_S2
 from module_agent.model.chain import Array
 from module_agent.model.imu_prior import ACCEL_BIAS_SIGMA_M_S2
@@ -49,10 +50,10 @@ HALTED_S, HALTED_RAD, FOLLOWED_RAD = 0.5, 0.1, 0.02
 STICKING, TURNS_RAD_S, TURNS_S, TURNING_SAMPLES = 1.25, 0.05, 0.05, 25
 # A position that changes by this much from one sample to the next, and neither before nor after it.
 JUMP_RAD = 0.02
-# Clocks of crystals, and some more; the least leap; steps between rows of this many usual ones are long.
-CRYSTAL, LEAP_NS, LONG_TICKS = 3e-4, 10_000_000, 3.0
-# So many round trips before and after an instant tell whether a clock stood: those of 0.6 s each.
-STEP_TRIPS = 10
+# Steps between rows of this many usual ones are long.
+LONG_TICKS = 3.0
+# So many other modules tell whether a clock stood: with all of many, each would be compared with each.
+WITNESSES = 3
 # The specific force at rest is that of gravity within this share, many times what any accelerometer is off.
 GRAVITY_SHARE = 0.25
 _IMU: tuple[tuple[str, str, float, Sickness, Sickness], ...] = (
@@ -397,12 +398,13 @@ def _jumps(serial: str, rows: Rows) -> Iterable[Finding]:
 
 
 def _clocks(recording: Recording, rows: dict[str, Rows]) -> Iterable[Finding]:
-    """Yield the clocks that went back, leapt, or stood while round trips show that the session's did not.
+    """Yield the clocks that went back, leapt, or stood, while round trips show that others did not.
 
     An agent that was held up leaves as large a hole between two rows, but its clock agrees with the session's
-    as before; a simulated world that catches up makes all modules early. What a module measures while its
-    clock stands is refused, and leaves no sign in its rows: round trips tell that it is late from then on.
+    as before. What a module measures while its clock stands is refused, and leaves no sign in its rows.
     """
+    trips = {serial: module.round_trips for serial, module in recording.modules.items()}
+    around = list(trips)
     for serial, own in rows.items():
         t_ns = own["t_ns"].astype(np.int64)
         gap = np.diff(t_ns)
@@ -410,18 +412,23 @@ def _clocks(recording: Recording, rows: dict[str, Rows]) -> Iterable[Finding]:
             continue
         usual = float(np.median(gap))
         back, leap = int(gap.argmin()), int(gap.argmax())
+        others = [trips[other] for other in _following(around, serial)]
         at = None
         if gap[back] < 0:
             at = back
-        elif gap[leap] > LEAP_NS + LONG_TICKS * usual and _leapt(recording, serial, int(t_ns[leap])):
+        elif gap[leap] > LEAP_NS + LONG_TICKS * usual and leapt(trips[serial], others, int(t_ns[leap])):
             at = leap
+        stood = stood_ns(trips[serial], others[:WITNESSES]) if at is None else None
         if at is not None:
             yield _clock_jump(serial, "a step of its clock between two rows", float(gap[at]), usual)
-            continue
-        others = [module.round_trips for s, module in recording.modules.items() if s != serial]
-        stood_ns = _stood_ns(recording.modules[serial].round_trips, others)
-        if stood_ns is not None:
-            yield _clock_jump(serial, "a step of its clock against the session's", -stood_ns, 0.0)
+        elif stood is not None:
+            yield _clock_jump(serial, "a step of its clock against those of others", -stood, 0.0)
+
+
+def _following(serials: list[str], serial: str) -> list[str]:
+    """Return all others, from the one that follows on."""
+    at = serials.index(serial)
+    return serials[at + 1 :] + serials[:at]
 
 
 def _clock_jump(serial: str, what: str, step_ns: float, usual_ns: float) -> Finding:
@@ -437,78 +444,6 @@ def _clock_jump(serial: str, what: str, step_ns: float, usual_ns: float) -> Find
         "clock_jump",
         True,
     )
-
-
-def _stood_ns(trips: Sequence[RoundTrip], others: Sequence[Sequence[RoundTrip]]) -> float | None:
-    """Return for how long a module's clock stood [ns] while another's went on; None if it never did.
-
-    A round trip bounds the session's time less the module's from both sides; medians leave out trips whose
-    answer was stale. A simulated world that falls behind makes all modules late, which says nothing of one.
-
-    Args:
-        trips: of the module, as they came back.
-        others: those of every other module.
-    """
-    if len(trips) < 2 * STEP_TRIPS:
-        return None
-    at_least, at_most = (
-        np.median(sliding_window_view(bound, STEP_TRIPS), axis=1) for bound in _session_less_module_ns(trips)
-    )
-    received_ns = np.array([trip.received_ns for trip in trips], dtype=np.int64)
-    lasted_ns = received_ns[2 * STEP_TRIPS - 1 :] - received_ns[: len(trips) - 2 * STEP_TRIPS + 1]
-    late = at_least[STEP_TRIPS:] - at_most[:-STEP_TRIPS] - CRYSTAL * lasted_ns
-    worst = int(late.argmax())
-    late_ns = float(late[worst])
-    if late_ns <= LEAP_NS:
-        return None
-    began_ns, stepped_ns, ended_ns = (
-        int(received_ns[worst + k]) for k in (0, STEP_TRIPS, 2 * STEP_TRIPS - 1)
-    )
-    went_on = [_late_at_most(other, began_ns, stepped_ns, ended_ns) < late_ns - LEAP_NS for other in others]
-    return late_ns if any(went_on) else None
-
-
-def _late_at_most(trips: Sequence[RoundTrip], began_ns: int, stepped_ns: int, ended_ns: int) -> float:
-    """Return by how much a clock is later [ns] after an instant than before it, at the most.
-
-    By the round trips from `began_ns` to `ended_ns` of the session; infinite without any before or after.
-    """
-    before = [trip for trip in trips if began_ns <= trip.received_ns < stepped_ns]
-    after = [trip for trip in trips if stepped_ns <= trip.received_ns <= ended_ns]
-    if not before or not after:
-        return math.inf
-    (least, _), (_, most) = (_session_less_module_ns(some) for some in (before, after))
-    return float(np.median(most) - np.median(least))
-
-
-def _session_less_module_ns(trips: Sequence[RoundTrip]) -> tuple[Array, Array]:
-    """Return the bounds (n,) [ns] of the session's time less the module's, but for a common constant."""
-    sent, received, module = (np.array(column, dtype=np.int64) for column in zip(*trips, strict=True))
-    return (sent - module).astype(float), (received - module).astype(float)
-
-
-def _leapt(recording: Recording, serial: str, module_ns: int) -> bool:
-    """Return whether a module's clock, and not those of all modules, is early after one of its instants."""
-    trips = recording.modules[serial].round_trips
-    before = [trip.received_ns for trip in trips if trip.module_ns <= module_ns]
-    if not before:
-        return False
-    others = [module.round_trips for s, module in recording.modules.items() if s != serial]
-    early = [_early_after(other, max(before)) for other in others]
-    return _early_after(trips, max(before)) and not (early and all(early))
-
-
-def _early_after(trips: Sequence[RoundTrip], session_ns: int) -> bool:
-    """Return whether a module's clock is ahead of the session's after an instant, compared with before.
-
-    A round trip bounds by how much the session's time exceeds the module's, from both sides.
-    """
-    before = [trip.sent_ns - trip.module_ns for trip in trips if trip.received_ns <= session_ns]
-    after = [trip.received_ns - trip.module_ns for trip in trips if trip.sent_ns >= session_ns]
-    if not before or not after:
-        return False
-    drift_ns = CRYSTAL * (trips[-1].received_ns - trips[0].sent_ns)
-    return min(after) < max(before) - LEAP_NS - drift_ns
 
 
 def _not_finite(recording: Recording, serials: Sequence[str]) -> Iterable[Finding]:

@@ -68,17 +68,21 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     }
 
 
+def simultaneous(reference_ns: Times, sent_ns: Times) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return for requests at (n,) times which to the reference are nearest, and whether at the same moment."""
+    order = np.argsort(reference_ns, kind="stable")
+    at = np.searchsorted(reference_ns[order], sent_ns)
+    before, after = order[np.maximum(at - 1, 0)], order[np.minimum(at, len(order) - 1)]
+    is_before = np.abs(reference_ns[after] - sent_ns) >= np.abs(reference_ns[before] - sent_ns)
+    near = np.where(is_before, before, after)
+    return near, np.abs(reference_ns[near] - sent_ns) <= SAME_MOMENT_NS
+
+
 def _relative_map(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
     """Return the map of a module from trips simultaneous with those of the reference, whose map is `base`."""
     sent_r, received_r, module_r = reference
     sent, received, module = trips
-    order = np.argsort(sent_r, kind="stable")
-    at = np.clip(np.searchsorted(sent_r[order], sent), 1, len(order) - 1) if len(order) > 1 else None
-    if at is None:
-        return _map(trips)
-    before, after = order[at - 1], order[at]
-    near = np.where(np.abs(sent_r[after] - sent) < np.abs(sent_r[before] - sent), after, before)
-    same = np.abs(sent_r[near] - sent) <= SAME_MOMENT_NS
+    near, same = simultaneous(sent_r, sent)
     if np.count_nonzero(same) < MIN_PAIRS:
         return _map(trips)
     near, sent, received, module = near[same], sent[same], received[same], module[same]

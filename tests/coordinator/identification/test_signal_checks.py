@@ -1,25 +1,18 @@
 """Sick columns are found in the samples alone; exact sensors, joints at rest and late agents are not sick."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from coordinator.identification.signal_checks import (
-    CRYSTAL,
-    STEP_TRIPS,
     _clipped,
-    _early_after,
     _error_while_turning,
     _inertial,
     _jumps,
-    _stood_ns,
     _worst_halt,
     chance_repeats,
     runs,
     sample_noise,
 )
-from coordinator.recording.recording import RoundTrip
 from module_agent.model.chain import Array
 from module_agent.wire.feedback_rows import ROW, Rows
 
@@ -118,56 +111,6 @@ def test_a_position_that_no_robot_has_is_a_jump() -> None:
     damaged = rows()
     damaged["position_rad"][1000] = 0.5 * np.finfo(damaged["position_rad"].dtype).max
     assert [one.kind for one in _jumps("A", damaged)] == ["encoder_jump"]
-
-
-def trips(offset_ns: Any, seconds: int = 20) -> list[RoundTrip]:
-    """Twice a second; the session's clock exceeds the module's by `offset_ns(session time)`."""
-    at = [500_000_000 * k for k in range(2 * seconds)]
-    return [RoundTrip(t, t + 2_000_000, t + 1_000_000 - int(offset_ns(t))) for t in at]
-
-
-def test_a_clock_that_leaps_is_told_from_an_agent_that_is_late_and_a_crystal_that_drifts() -> None:
-    middle = 10_000_000_000
-    assert _early_after(trips(lambda t: -50e6 if t > middle else 0.0), middle)
-    assert not _early_after(trips(lambda t: 0.0), middle)
-    assert not _early_after(trips(lambda t: -1e-4 * t), middle)
-    # A world that falls behind makes its modules late, not early.
-    assert not _early_after(trips(lambda t: 50e6 if t > middle else 0.0), middle)
-
-
-def test_a_clock_that_stood_is_told_from_a_world_that_fell_behind() -> None:
-    """From ten seconds on the module is late by 30 ms; where all others are, the session's clock leapt."""
-
-    def late(t_ns: int) -> float:
-        return 30e6 if t_ns > 10e9 else 0.0
-
-    still, crystal = trips(lambda t: 0.0), trips(lambda t: 1e-4 * t)
-    found = _stood_ns(trips(late), [crystal, trips(late)])
-    # A trip of 2 ms bounds the time within them.
-    assert found == pytest.approx(30e6, abs=3e6 + CRYSTAL * 2 * STEP_TRIPS * 0.5e9)
-    assert _stood_ns(trips(late), [trips(late), trips(late)]) is None
-    assert _stood_ns(trips(late), []) is None
-    assert _stood_ns(trips(late)[: 2 * STEP_TRIPS - 1], [still]) is None
-    assert _stood_ns(crystal, [still]) is None
-    # One that leaps is early, and the others are not late for it.
-    assert _stood_ns(trips(lambda t: -late(t)), [still]) is None
-    assert _stood_ns(still, [trips(lambda t: -late(t))]) is None
-
-
-def test_answers_that_were_held_up_are_no_step_of_a_clock() -> None:
-    """An agent is held up for two seconds, or answers four times with the time at which it was."""
-    still = trips(lambda t: 0.0)
-    waited = [
-        trip._replace(received_ns=max(trip.received_ns, 12_000_000_000))
-        if 10e9 < trip.sent_ns < 12e9
-        else trip
-        for trip in still
-    ]
-    stale = [
-        trip._replace(module_ns=10_000_000_000) if 10e9 < trip.sent_ns <= 12e9 else trip for trip in still
-    ]
-    assert _stood_ns(waited, [still]) is None
-    assert _stood_ns(stale, [still]) is None
 
 
 def test_noise_is_measured_under_motion_and_through_stretches_that_are_stuck() -> None:
