@@ -69,7 +69,7 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
 
 
 def simultaneous(reference_ns: Times, sent_ns: Times) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return for requests at (n,) times which to the reference are nearest, and whether at the same moment."""
+    """Return which requests to the reference are nearest to those at (n,) times, and whether at once."""
     order = np.argsort(reference_ns, kind="stable")
     at = np.searchsorted(reference_ns[order], sent_ns)
     before, after = order[np.maximum(at - 1, 0)], order[np.minimum(at, len(order) - 1)]

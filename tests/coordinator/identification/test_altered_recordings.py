@@ -212,6 +212,21 @@ def test_a_sick_module_is_named_and_the_robot_identified_without_it(run: list[En
     _covered(found.kinematics)
 
 
+def _stood(run: list[Entry], ill: tuple[str, ...], middle: int) -> list[Entry]:
+    """The clock is later by 0.3 s in answers alone: rows of the time that it stood are refused."""
+    leapt = leaping_clock(-300_000_000)(run, ill, middle)
+    return [late if late.kind == "reply" else entry for late, entry in zip(leapt, run, strict=True)]
+
+
+def test_a_clock_that_stood_is_named_by_its_answers(run: list[Entry]) -> None:
+    found = identify(_sick(run, _stood, ELBOW))
+    (finding,) = [one for one in found.result.sensors if one.serious]
+    assert (finding.serial, finding.kind) == (ELBOW, "clock_jump")
+    assert finding.measured == pytest.approx(-0.3, abs=0.01)
+    assert found.result.excluded == [ELBOW]
+    _covered(found.kinematics)
+
+
 def test_a_link_that_turned_and_has_no_length_makes_the_robot_suspect(run: list[Entry]) -> None:
     """The elbow's IMU may be anywhere, by residuals that leave nothing: its lift turned it nevertheless."""
     found = identify_kinematics(_altered(run, lambda *_: None))
