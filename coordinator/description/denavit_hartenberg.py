@@ -97,7 +97,9 @@ def _hayati(frame: Array, axis: Array, point: Array) -> tuple[DhRow, Array]:
     towards = (met - origin) / a_m if a_m > MEETING_BELOW_M else x
     between = _frame(z, towards, met)
     aside, back, ahead = axis @ between[:3, :3]
+    # Of axes that are all but opposite alpha is all but pi, from either side.
     alpha, beta = float(np.arctan2(-back, ahead)), float(np.arcsin(aside))
+    alpha += 2.0 * np.pi if alpha < -0.5 * np.pi else 0.0
     following = between.copy()
     following[:3, :3] = between[:3, :3] @ Rotation.from_euler("XY", [alpha, beta]).as_matrix()
     return DhRow("", _angle(x, towards, z), 0.0, a_m, alpha, beta), following

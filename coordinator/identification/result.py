@@ -139,8 +139,8 @@ class PairPart(Part):
 class DhRowPart(Part):
     """One joint's parameters (thesis eq. 2); `theta_rad` is added to the joint's position.
 
-    beta_rad: Hayati's, a last turn about y, where the next axis is nearly parallel; 0 in older results, whose
-    d_m and a_m are large then.
+    beta_rad: Hayati's, a last turn about y, where the next axis is parallel within 0.1 rad; 0 in older
+    results, whose d_m is large then.
     """
 
     serial: str

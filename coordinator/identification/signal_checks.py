@@ -17,7 +17,7 @@ from scipy.special import erf
 from coordinator.identification.finding import UNUSABLE, Finding, Sickness, motion_of
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import ModuleRecord, Recording
-from coordinator.synchronisation.clock_steps import LEAP_NS, leapt, stood_ns
+from coordinator.synchronisation.clock_steps import LEAP_NS, clocks_that_stood, leapt
 from module_agent.model.catalogue import GRAVITY_M_S2
 from module_agent.model.chain import Array
 from module_agent.model.imu_prior import ACCEL_BIAS_SIGMA_M_S2
@@ -52,8 +52,6 @@ STICKING, TURNS_RAD_S, TURNS_S, TURNING_SAMPLES = 1.25, 0.05, 0.05, 25
 JUMP_RAD = 0.02
 # Steps between rows of this many usual ones are long.
 LONG_TICKS = 3.0
-# So many other modules tell whether a clock stood: with all of many, each would be compared with each.
-WITNESSES = 3
 # The specific force at rest is that of gravity within this share, many times what any accelerometer is off.
 GRAVITY_SHARE = 0.25
 _IMU: tuple[tuple[str, str, float, Sickness, Sickness], ...] = (
@@ -404,7 +402,7 @@ def _clocks(recording: Recording, rows: dict[str, Rows]) -> Iterable[Finding]:
     as before. What a module measures while its clock stands is refused, and leaves no sign in its rows.
     """
     trips = {serial: module.round_trips for serial, module in recording.modules.items()}
-    around = list(trips)
+    stood = clocks_that_stood(trips)
     for serial, own in rows.items():
         t_ns = own["t_ns"].astype(np.int64)
         gap = np.diff(t_ns)
@@ -412,23 +410,16 @@ def _clocks(recording: Recording, rows: dict[str, Rows]) -> Iterable[Finding]:
             continue
         usual = float(np.median(gap))
         back, leap = int(gap.argmin()), int(gap.argmax())
-        others = [trips[other] for other in _following(around, serial)]
+        others = [some for other, some in trips.items() if other != serial]
         at = None
         if gap[back] < 0:
             at = back
         elif gap[leap] > LEAP_NS + LONG_TICKS * usual and leapt(trips[serial], others, int(t_ns[leap])):
             at = leap
-        stood = stood_ns(trips[serial], others[:WITNESSES]) if at is None else None
         if at is not None:
             yield _clock_jump(serial, "a step of its clock between two rows", float(gap[at]), usual)
-        elif stood is not None:
-            yield _clock_jump(serial, "a step of its clock against those of others", -stood, 0.0)
-
-
-def _following(serials: list[str], serial: str) -> list[str]:
-    """Return all others, from the one that follows on."""
-    at = serials.index(serial)
-    return serials[at + 1 :] + serials[:at]
+        elif serial in stood:
+            yield _clock_jump(serial, "a step of its clock against those of others", -stood[serial], 0.0)
 
 
 def _clock_jump(serial: str, what: str, step_ns: float, usual_ns: float) -> Finding:

@@ -7,7 +7,8 @@ catches up makes them early. Two requests at the same moment bound by how much o
 whatever the session's clock does meanwhile.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -19,10 +20,9 @@ from module_agent.signals.clock_map import Times
 
 # What two clocks of crystals drift apart, and some more; the least step.
 CRYSTAL, LEAP_NS = 3e-4, 10_000_000
-# So many trips before and after an instant tell whether a clock stood then: half a second of each, or more.
-STEP_TRIPS = 10
-
-_Bound = NDArray[np.float64]
+# So many trips before and after an instant tell whether a clock stood then, unless they take so long that the
+# drift of poor crystals counts. By so many other modules.
+STEP_TRIPS, LONGEST_NS, WITNESSES = 10, 20_000_000_000, 3
 
 
 def leapt(trips: Sequence[RoundTrip], others: Sequence[Sequence[RoundTrip]], module_ns: int) -> bool:
@@ -49,52 +49,72 @@ def _early_after(trips: Sequence[RoundTrip], session_ns: int) -> bool:
     return min(after) < max(before) - LEAP_NS - drift_ns
 
 
-def stood_ns(trips: Sequence[RoundTrip], witnesses: Sequence[Sequence[RoundTrip]]) -> float | None:
-    """Return for how long a module's clock stood [ns], or went back by; None if it did not.
+def clocks_that_stood(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, float]:
+    """Return for how long clocks stood, or by how much they went back, at the least [ns]; by serial.
 
-    It did if it is behind most of the witnesses from one instant on, and behind the session: one that is
-    behind a witness only is a witness that leapt.
-
-    Args:
-        trips: of the module.
-        witnesses: those of other modules, to which requests were sent along with its own.
+    A module's did if from one instant on it is behind most of the witnesses, and behind the session: one that
+    is behind a witness only is behind one that leapt. Witnesses are the modules that are most often asked at
+    the same moment; whom too few requests join has none, and is not in the result.
     """
-    behind = [ns for ns in (_step_behind(trips, other) for other in witnesses if other) if ns is not None]
-    stood = [ns for ns in behind if ns > 0.0]
-    return float(np.median(stood)) if 2 * len(stood) > len(behind) else None
+    columns = {serial: _Trips.of(some) for serial, some in trips.items() if some}
+    found = {}
+    for serial, own in columns.items():
+        pairs = [_paired(own, other) for name, other in columns.items() if name != serial]
+        pairs = [pair for pair in pairs if len(pair[0].sent_ns) >= 2 * STEP_TRIPS]
+        pairs.sort(key=lambda pair: len(pair[0].sent_ns), reverse=True)
+        behind = [_step_behind(*pair) for pair in pairs[:WITNESSES]]
+        stood = [ns for ns in behind if ns > 0.0]
+        if 2 * len(stood) > len(behind):
+            found[serial] = float(np.median(stood))
+    return found
 
 
-def _step_behind(trips: Sequence[RoundTrip], witness: Sequence[RoundTrip]) -> float | None:
+class _Trips(NamedTuple):
+    """Trips (n,) as columns, in the order of sending."""
+
+    sent_ns: Times
+    received_ns: Times
+    module_ns: Times
+
+    @classmethod
+    def of(cls, trips: Sequence[RoundTrip]) -> Self:
+        return cls(*np.array(sorted(trips), dtype=np.int64).T)
+
+    def at(self, which: NDArray[np.intp]) -> "_Trips":
+        return _Trips(*(column[which] for column in self))
+
+
+def _paired(own: _Trips, witness: _Trips) -> tuple[_Trips, _Trips]:
+    """Return the trips to a module, and those to another one at the same moments."""
+    near, same = simultaneous(witness.sent_ns, own.sent_ns)
+    return own.at(np.flatnonzero(same)), witness.at(near[same])
+
+
+def _step_behind(own: _Trips, witness: _Trips) -> float:
     """Return by how much a module falls behind another one, and the session, at once and for good [ns].
 
-    Zero if it does not; None if too few requests to the two were simultaneous. Medians of successive trips
-    leave out single answers that were stale.
+    Zero if it does not. Medians of successive trips leave out single answers that were stale.
     """
-    if not trips:
-        return None
-    sent, received, module = _columns(trips)
-    sent_w, received_w, module_w = _columns(witness)
-    near, same = simultaneous(sent_w, sent)
-    if np.count_nonzero(same) < 2 * STEP_TRIPS:
-        return None
-    sent, received, module, near = sent[same], received[same], module[same], near[same]
-    ahead = module_w[near] - module
-    least, most = _medians(ahead - (received_w[near] - sent)), _medians(ahead - (sent_w[near] - received))
-    span = received[2 * STEP_TRIPS - 1 :] - received[: len(received) - 2 * STEP_TRIPS + 1]
-    steps = least[STEP_TRIPS:] - most[:-STEP_TRIPS] - CRYSTAL * span
+    ahead = witness.module_ns - own.module_ns
+    least = _medians(ahead - (witness.received_ns - own.sent_ns))
+    most = _medians(ahead - (witness.sent_ns - own.received_ns))
+    windows = sliding_window_view(own.received_ns, 2 * STEP_TRIPS)
+    span_ns = windows[:, -1] - windows[:, 0]
+    steps = least[STEP_TRIPS:] - most[:-STEP_TRIPS] - CRYSTAL * span_ns
+    steps[span_ns > LONGEST_NS] = -np.inf
     at = int(steps.argmax())
     step = float(steps[at])
-    lasts = float(least[at + STEP_TRIPS :].min()) > float(most[at]) + 0.5 * step
-    late = float(_medians(sent - module)[at + STEP_TRIPS] - _medians(received - module)[at])
-    return step if step > LEAP_NS and lasts and late > max(0.5 * step, LEAP_NS) else 0.0
+    if step <= LEAP_NS:
+        return 0.0
+    drifted = CRYSTAL * (own.received_ns[at + 2 * STEP_TRIPS - 1 :] - own.received_ns[at])
+    lasts = float((least[at + STEP_TRIPS :] + drifted).min()) > float(most[at]) + 0.5 * step
+    session = own.sent_ns - own.module_ns, own.received_ns - own.module_ns
+    late = _medians(session[0])[STEP_TRIPS:] - _medians(session[1])[:-STEP_TRIPS]
+    # A world that is slow all the time makes every module late.
+    unusual = float(late[at]) - max(float(np.median(late)), 0.0)
+    return step if lasts and unusual > max(0.5 * step, LEAP_NS) else 0.0
 
 
-def _medians(bound_ns: Times) -> _Bound:
+def _medians(bound_ns: Times) -> NDArray[np.float64]:
     """Return the medians of all stretches of `STEP_TRIPS` successive bounds."""
     return np.asarray(np.median(sliding_window_view(bound_ns.astype(np.float64), STEP_TRIPS), axis=1))
-
-
-def _columns(trips: Sequence[RoundTrip]) -> tuple[Times, Times, Times]:
-    """Return sent, received and module times, in the order of sending."""
-    columns = np.array(sorted(trips), dtype=np.int64)
-    return columns[:, 0], columns[:, 1], columns[:, 2]

@@ -98,13 +98,14 @@ def test_parallel_meeting_and_coinciding_axes_have_tables_too(
     np.testing.assert_allclose(displaced(chain, path, q), body_displacements(chain, q)[:, -1], atol=1e-9)
 
 
-def test_noise_of_parallel_axes_leaves_their_rows_where_they_are() -> None:
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_noise_of_parallel_axes_leaves_their_rows_where_they_are(way: float) -> None:
     """Two milliradians put the common normal of axes 0.3 m apart more than a hundred metres away."""
     rng = np.random.default_rng(5)
     ideal = [[0, 0, 0], [0.3, 0, 0.05], [0.3, 0.2, 0.1]]
-    known = dh_path(straight([[0, 0, 1]] * 3, ideal), 2)
+    known = dh_path(straight([[0, 0, 1], [0, 0, way], [0, 0, 1]], ideal), 2)
     for _ in range(20):
-        tilted = [[*rng.normal(0.0, 2e-3, 2), 1.0] for _ in range(3)]
+        tilted = [[*rng.normal(0.0, 2e-3, 2), up] for up in (1.0, way, 1.0)]
         noisy = dh_path(straight(tilted, ideal), 2)
         assert [row.d_m for row in noisy.rows] == [0.0, 0.0, 0.0]
         np.testing.assert_allclose(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.recording.recording import RoundTrip
-from coordinator.synchronisation.clock_steps import CRYSTAL, STEP_TRIPS, leapt, stood_ns
+from coordinator.synchronisation.clock_steps import CRYSTAL, STEP_TRIPS, clocks_that_stood, leapt
 
 EVERY_NS, SECONDS = 60_000_000, 20
 # From the middle on something is otherwise.
@@ -23,6 +23,12 @@ def trips(behind_ns: Behind, keep: Callable[[int], bool] = lambda t: True) -> li
         for t in range(0, SECONDS * 1_000_000_000, EVERY_NS)
         if keep(t)
     ]
+
+
+def stood_ns(own: list[RoundTrip], witnesses: list[list[RoundTrip]]) -> float | None:
+    """What is said of a module, by others that are asked along with it."""
+    others = {f"W{k}": witness for k, witness in enumerate(witnesses)}
+    return clocks_that_stood({"A": own} | others).get("A")
 
 
 def later(size_ns: float, since_ns: float = MIDDLE_NS) -> Behind:
@@ -70,6 +76,8 @@ def test_without_enough_trips_or_a_witness_nothing_is_known() -> None:
 def test_a_world_that_falls_behind_and_a_witness_that_leaps_are_no_step_of_ones_own() -> None:
     stood = trips(later(30e6))
     assert stood_ns(stood, [stood, stood]) is None
+    # Of two witnesses that differ neither is believed.
+    assert stood_ns(stood, [stood, STILL]) is None
     assert stood_ns(CRYSTALS, [STILL]) is None
     assert stood_ns(STILL, [CRYSTALS]) is None
     # The witness is ahead from the middle on, or the module itself.
@@ -77,6 +85,60 @@ def test_a_world_that_falls_behind_and_a_witness_that_leaps_are_no_step_of_ones_
     assert stood_ns(trips(later(-30e6)), [STILL]) is None
     # It leaps as the world slips: the module is behind it, and behind the session by less.
     assert stood_ns(trips(later(20e6)), [trips(later(-280e6))]) is None
+
+
+@pytest.mark.parametrize("share", [0.05, 0.1])
+@pytest.mark.parametrize("size_ns", [25e6, 100e6])
+def test_a_witness_that_leaps_in_a_slow_world_is_no_step_of_ones_own(share: float, size_ns: float) -> None:
+    """All modules are late, more and more."""
+
+    def slow(t: float) -> float:
+        return share * t
+
+    assert stood_ns(trips(slow), [trips(both(slow, later(-size_ns)))]) is None
+    assert stood_ns(trips(both(slow, later(size_ns))), [trips(slow)]) is not None
+
+
+def test_an_hour_between_trips_is_time_for_crystals_to_drift() -> None:
+    """350 ppm of each other are 1.3 s in an hour; a session that is resumed has such a gap in its trips."""
+    pause_ns = 3600 * 1_000_000_000
+
+    def resumed(fast: float) -> list[RoundTrip]:
+        return [
+            RoundTrip(
+                one.sent_ns + pause, one.received_ns + pause, round((1.0 + fast) * (one.module_ns + pause))
+            )
+            for pause in (0, pause_ns)
+            for one in trips(lambda t: 0.0)
+        ]
+
+    for fast in (3.5e-4, -3.5e-4):
+        assert stood_ns(resumed(0.0), [resumed(fast)]) is None
+        assert stood_ns(resumed(fast), [resumed(0.0)]) is None
+
+
+def test_crystals_that_drift_for_long_hide_no_step() -> None:
+    """The witness is slower: after five minutes it is behind by half of what the module stood."""
+    stood = [t for k in range(15) for t in _shifted(trips(later(30e6) if k == 0 else lambda t: 30e6), k)]
+    slower = [
+        t._replace(module_ns=round((1.0 - 5e-5) * t.module_ns)) for k in range(15) for t in _shifted(STILL, k)
+    ]
+    assert stood_ns(stood, [slower]) == pytest.approx(30e6, abs=6e6)
+
+
+def _shifted(some: list[RoundTrip], k: int) -> list[RoundTrip]:
+    return [RoundTrip(*(t + k * SECONDS * 1_000_000_000 for t in trip)) for trip in some]
+
+
+def test_those_are_asked_who_were_asked_at_the_same_moments() -> None:
+    """Modules of a large robot are asked by turns: three have other turns, and one has the same."""
+    stood, moved = trips(later(30e6)), [_at_once(STILL, 20_000_000)] * 3
+    assert stood_ns(stood, moved) is None
+    assert stood_ns(stood, [*moved, STILL]) == pytest.approx(30e6, abs=5e6)
+
+
+def _at_once(some: list[RoundTrip], later_ns: int) -> list[RoundTrip]:
+    return [RoundTrip(*(t + later_ns for t in trip)) for trip in some]
 
 
 @pytest.mark.parametrize("held_ns", [0.3e9, 0.7e9, 0.9e9, 3e9])
