@@ -52,9 +52,9 @@ def _early_after(trips: Sequence[RoundTrip], session_ns: int) -> bool:
 def clocks_that_stood(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, float]:
     """Return for how long clocks stood, or by how much they went back, at the least [ns]; by serial.
 
-    A module's did if from one instant on it is behind most of the witnesses, and behind the session: one that
-    is behind a witness only is behind one that leapt. Witnesses are the modules that are most often asked at
-    the same moment; whom too few requests join has none, and is not in the result.
+    A clock stood if its module is behind most of the witnesses from one instant on, and behind the session:
+    one that is behind a witness only is behind one that leapt. Witnesses are the modules that are most often
+    asked at the same moment; of a module that is asked by itself nothing is known.
     """
     columns = {serial: _Trips.of(some) for serial, some in trips.items() if some}
     found = {}
