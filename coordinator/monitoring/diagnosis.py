@@ -275,7 +275,9 @@ def weighed(
     sigma_nm = reference.torque_sigma_nm * np.sqrt(reference.torque.inflation)
     try:
         payload = find_payload(
-            before, later, places_on_axes(reference.chain), sigma_nm, carriers=[load.carrier]
+            *(before, later, places_on_axes(reference.chain), sigma_nm),
+            carriers=[load.carrier],
+            scale_sigma=reference.torque_scale_sigma,
         )
     except NotSolvedError:
         return None

@@ -62,7 +62,7 @@ from coordinator.monitoring.segments import (
     noise_level,
     without_offsets,
 )
-from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE
+from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE, SCALE_SIGMA
 from coordinator.recording.journal import JournalEvent, since_joined
 from coordinator.synchronisation.motion_windows import (
     INDEPENDENT_FRACTION,
@@ -147,8 +147,9 @@ class Reference(NamedTuple):
     """A robot that is well.
 
     phi, torque_offset_nm: (10 n,) and (n,), see `fitted_torques`; all else is of torques without the offsets.
-    torque_sigma_nm: (n,) noise of the torques as if samples were independent. information: what the run says
-    of the inertial parameters. drives: None of a joint that hardly moved. together: see `moved_together`.
+    torque_sigma_nm: (n,) noise of the torques as if samples were independent. torque_scale_sigma: standard
+    deviation of their sensors' scales; zero if calibrated. information: what the run says of the inertial
+    parameters. drives: None of a joint that hardly moved. together: see `moved_together`.
     """
 
     name: str
@@ -157,6 +158,7 @@ class Reference(NamedTuple):
     phi: Array
     torque_offset_nm: Array
     torque_sigma_nm: Array
+    torque_scale_sigma: float
     information: tuple[JointInformation, ...]
     torque: BaselineTest
     imu_model: ImuModel
@@ -213,6 +215,7 @@ def build_reference(known: BaselineRobot) -> Reference:
         phi=phi,
         torque_offset_nm=offset_nm,
         torque_sigma_nm=sigma,
+        torque_scale_sigma=SCALE_SIGMA[recording.torque],
         information=information,
         torque=torque,
         imu_model=model,
