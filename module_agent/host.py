@@ -50,6 +50,8 @@ from module_agent.wire.topics import PUBLISHED_TO_MODULE, SERVED, TOPICS
 HISTORY_TIMEOUT_S = 0.4
 # A question whose answer is dropped on arrival would otherwise be remembered for ever.
 MAX_ASKED = 1024
+# So many rows of motions may wait for their estimates: of 64 joints that moved at once for two minutes.
+MAX_WAITING_ROWS = 2_000_000
 
 T = TypeVar("T")
 M = TypeVar("M", Status, Feedback, Ack)
@@ -211,7 +213,9 @@ class AgentHost:
         self._transport = transport
         self._motion_listener = MotionListener()
         self._from_others = Inbox(MAX_MESSAGE_BYTES, bell=self.bell)
-        self._findings: list[tuple[HostedModule, Finding]] = []
+        # Of each module, and how many rows its motion had if no other estimate waits for them.
+        self._findings: list[tuple[HostedModule, Finding, int]] = []
+        self._waiting_rows = 0
         self._listening: dict[str, Undeclare] = {}
         self._declared: list[Undeclare] = []
         self._asked: dict[int, AskHistory] = {}
@@ -390,20 +394,28 @@ class AgentHost:
             else:
                 self._ask_history(wanted)
         for motion in motions:
+            rows = len(motion.rows)
+            if self._waiting_rows + rows > MAX_WAITING_ROWS:
+                # Motions are announced faster than they can have been made.
+                for module in self.modules:
+                    module.firmware.admission.count(Refusal.LIMIT)
+                continue
+            self._waiting_rows += rows
             for module in self.modules:
-                self._submit(module, motion)
+                self._submit(module, motion, rows if module is self.modules[-1] else 0)
 
     def _publish_findings(self) -> None:
         while self._findings:
-            module, finding = self._findings.pop(0)
+            module, finding, rows = self._findings.pop(0)
+            self._waiting_rows -= rows
             module.observer.keep(finding)
             self._transport.publish(module.key(Leaf.ESTIMATE), encode(module.estimate(finding)))
 
-    def _submit(self, module: HostedModule, motion: JointMotion) -> None:
+    def _submit(self, module: HostedModule, motion: JointMotion, rows: int) -> None:
         job = module.observer.job(motion, module.firmware.history, module.firmware.last_rest)
 
         def done(finding: Finding) -> None:
-            self._findings.append((module, finding))
+            self._findings.append((module, finding, rows))
             self.bell[0] = 1
 
         self.worker.submit(job, done)

@@ -6,7 +6,7 @@ import secrets
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -310,8 +310,10 @@ def _list(library: str) -> None:
 
 def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
     names = ", ".join(module.serial for module in host.modules)
-    typer.echo(f"x5-agent: {names}: {ATTACHED}, process {os.getpid()}", err=True)
     try:
+        # A closed terminal, or a log on a full disk, is no reason to leave the modules.
+        with suppress(OSError):
+            typer.echo(f"x5-agent: {names}: {ATTACHED}, process {os.getpid()}", err=True)
         while True:
             host.cycle()
     except HardwareLost as error:

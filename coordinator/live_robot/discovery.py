@@ -95,24 +95,53 @@ class _Arrivals:
                 return None
 
 
+class _Presence:
+    """The modules of which there are tokens, and until when others are waited for (`Search`)."""
+
+    def __init__(self, search: Search):
+        self._search = search
+        self._alive: dict[str, bool] = {}
+        self._start_s = self._changed_s = time.monotonic()
+
+    @property
+    def serials(self) -> list[str]:
+        """Those that are there now, sorted."""
+        return sorted(serial for serial, present in self._alive.items() if present)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether as many are there as are expected."""
+        return self._search.expect is not None and sum(self._alive.values()) >= self._search.expect
+
+    @property
+    def until_s(self) -> float:
+        """Until when others are waited for, by `time.monotonic`."""
+        quiet_s = self._search.quiet_s if self._alive else self._search.first_s
+        end_s = max(self._start_s + self._search.min_s, self._changed_s + quiet_s)
+        return min(end_s, self._start_s + MAX_S)
+
+    def take(self, event: Event) -> str | None:
+        """Take note of a token; return the serial of a module that has come."""
+        if not isinstance(event, Liveness):
+            return None
+        try:
+            serial = parse(event.key).serial
+        except WireError:  # the token of something that is no module
+            return None
+        self._alive[serial], self._changed_s = event.alive, time.monotonic()
+        return serial if event.alive else None
+
+
 def _present(transport: Transport, robot: str, search: Search) -> list[str]:
-    events = _Arrivals()
+    events, presence = _Arrivals(), _Presence(search)
     declared = transport.watch_alive(every(robot, Leaf.ALIVE), events.put)
-    alive: dict[str, bool] = {}
-    start = changed = time.monotonic()
-    while search.expect is None or sum(alive.values()) < search.expect:
-        quiet_s = search.quiet_s if alive else search.first_s
-        end = min(max(start + search.min_s, changed + quiet_s), start + MAX_S)
-        arrived = events.get(max(0.0, end - time.monotonic()))
+    while not presence.is_complete:
+        arrived = events.get(max(0.0, presence.until_s - time.monotonic()))
         if arrived is None:
             break
-        _, event = arrived
-        if isinstance(event, Liveness):
-            with suppress(WireError):  # the token of something that is no module
-                alive[parse(event.key).serial] = event.alive
-                changed = time.monotonic()
+        presence.take(arrived[1])
     declared.undeclare()
-    return sorted(serial for serial, present in alive.items() if present)
+    return presence.serials
 
 
 def _ask_all(
@@ -232,7 +261,12 @@ def light_led(transport: Transport, robot: str, serial: str, sender: str, on: bo
     event = None if arrived is None else arrived[1]
     if not isinstance(event, Reply) or event.payload is None:
         raise RobotError(f"module {serial} does not confirm that its LED is {'lit' if on else 'off'}")
-    ack = decode(Ack, event.payload)
+    try:
+        ack = decode(Ack, event.payload)
+    except WireError as error:
+        raise RobotError(f"the answer of module {serial} cannot be read: {error}") from error
+    if ack.serial != serial or (ack.re != 1 and (ack.accepted or ack.re)):
+        raise RobotError(f"what module {serial} answers is no answer to the question: {ack.serial}, {ack.re}")
     if not ack.accepted:
         raise RobotError(f"module {serial} refuses: {ack.reason}: {ack.detail}")
 
@@ -240,18 +274,21 @@ def light_led(transport: Transport, robot: str, serial: str, sender: str, on: bo
 def stop_robot(transport: Transport, robot: str, sender: str, search: Search) -> tuple[list[str], list[str]]:
     """Stop every module; return the serials that confirmed and those that did not. Closes the transport."""
     try:
-        serials = _present(transport, robot, search)
-        confirmed = asyncio.run(_stop_all(transport, robot, sender, serials))
+        confirmed = asyncio.run(_stop_all(transport, robot, sender, search))
     finally:
         transport.close()
-    stopped = [serial for serial, stops in zip(serials, confirmed, strict=True) if stops]
-    return stopped, [serial for serial in serials if serial not in stopped]
+    stopped = [serial for serial, stops in confirmed.items() if stops]
+    return stopped, [serial for serial in confirmed if serial not in stopped]
 
 
-async def _stop_all(transport: Transport, robot: str, sender: str, serials: list[str]) -> list[bool]:
-    """Return which modules confirm that they have stopped."""
+async def _stop_all(transport: Transport, robot: str, sender: str, search: Search) -> dict[str, bool]:
+    """Stop every module as soon as it is seen; return which confirm, by serial in their order.
+
+    The search for more goes on meanwhile: a module that makes it last, as it comes and goes, delays no stop.
+    """
     post = asyncio.get_running_loop().call_soon_threadsafe
     messenger = Messenger(transport, robot, time.monotonic_ns, post, Recording().accept)
+    presence, stops = _Presence(search), dict[str, asyncio.Task[bool]]()
 
     async def confirms(serial: str) -> bool:
         try:
@@ -260,4 +297,18 @@ async def _stop_all(transport: Transport, robot: str, sender: str, serials: list
             return False
         return True
 
-    return await asyncio.gather(*map(confirms, serials))
+    def see(event: Event) -> None:
+        serial = presence.take(event)
+        if serial is not None and serial not in stops:
+            stops[serial] = asyncio.create_task(confirms(serial))
+
+    def sink(event: Event) -> None:
+        post(see, event)
+
+    declared = transport.watch_alive(every(robot, Leaf.ALIVE), sink)
+    while not presence.is_complete and time.monotonic() < presence.until_s:
+        await asyncio.sleep(POLL_S)
+    declared.undeclare()
+    confirmed = {serial: await stops[serial] for serial in sorted(stops)}
+    there = {*presence.serials}
+    return {serial: stopped for serial, stopped in confirmed.items() if stopped or serial in there}

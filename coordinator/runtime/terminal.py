@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from module_agent.model.errors import EXIT_FAILED, UsageError
+from module_agent.model.errors import EXIT_FAILED, FileError, UsageError
 from module_agent.model.files import json_text, write_json
 
 _MIN_PIPE_WIDTH = 150
@@ -81,9 +81,16 @@ class JsonLines:
     def write(self, what: Mapping[str, object]) -> None:
         """Write a line."""
         stream = sys.stdout if self.to_standard_output else self._file
-        if stream is not None:
+        if stream is None:
+            return
+        try:
             stream.write(json.dumps(what) + "\n")
             stream.flush()
+        except BrokenPipeError:
+            # The reader has gone, which is no fault of a file.
+            raise
+        except OSError as error:
+            raise FileError(OSError(error.errno, error.strerror, stream.name)) from error
 
     def close(self) -> None:
         """Close the file."""

@@ -97,7 +97,10 @@ class InformationRequests:
                 continue
             silent = 0
             if isinstance(answer, Information):
-                offset = answer.offset + len(answer.part)
+                if answer.offset != offset:
+                    self._note(f"{serial} answers with another part of its information than was asked for")
+                    return
+                offset += len(answer.part)
                 if offset >= answer.total_bytes:
                     return
             elif isinstance(answer, Ack) and answer.reason == Refusal.BUSY.value:

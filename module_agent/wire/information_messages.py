@@ -131,11 +131,20 @@ class InformationRequest(Message):
 class Information(Message):
     """Part of a module's answer: `total_bytes` of `information_block`, here those from `offset` on.
 
-    `digest` is the request's; `motion_ids` are the motions that it holds, each once.
+    `digest` is the request's; `motion_ids` are the motions that it holds, each once. No part is empty, and
+    none reaches beyond the block.
     """
 
     digest: Annotated[bytes, Field(min_length=32, max_length=32)]
     motion_ids: Annotated[tuple[Counter, ...], Field(max_length=64)]
     total_bytes: Annotated[int, Field(gt=0, le=4_194_304)]
     offset: Counter
-    part: Annotated[bytes, Field(max_length=MAX_PART_BYTES)]
+    part: Annotated[bytes, Field(min_length=1, max_length=MAX_PART_BYTES)]
+
+    @model_validator(mode="after")
+    def _check_end(self) -> Self:
+        if self.offset + len(self.part) > self.total_bytes:
+            raise out_of_range(
+                f"{len(self.part)} bytes from {self.offset} on are beyond the {self.total_bytes} of the block"
+            )
+        return self

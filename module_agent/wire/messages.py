@@ -190,7 +190,10 @@ class GainSet(Part):
 
 
 class MotionRecord(Part):
-    """A motion as the module ran it; rows are feedback rows, `end_row` is one past the last."""
+    """A motion as the module ran it; rows are feedback rows, `end_row` is one past the last.
+
+    One that is done has ended at a row.
+    """
 
     motion_id: Counter
     pattern: Annotated[Pattern | OtherMotion, Field(discriminator="kind")]
@@ -202,6 +205,8 @@ class MotionRecord(Part):
 
     @model_validator(mode="after")
     def _check_length(self) -> Self:
+        if self.outcome == "done" and self.end_row is None:
+            raise out_of_range(f"motion {self.motion_id} is done and has no last row")
         if self.end_row is not None and not 0 <= self.end_row - self.start_row <= MAX_ROWS_PER_MOTION:
             raise out_of_range(
                 f"motion {self.motion_id} of rows {self.start_row} to {self.end_row}: a motion has at most "
@@ -348,7 +353,7 @@ class Estimate(Message):
     """
 
     joint: Name
-    motion_ids: Annotated[tuple[Counter, ...], Field(max_length=16)]
+    motion_ids: Annotated[tuple[Counter, ...], Field(min_length=1, max_length=16)]
     moved: bool
     rate_ratio: Annotated[float, Field(ge=0.0, le=1e6)]
     gravity_m_s2: Vector3

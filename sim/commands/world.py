@@ -2,6 +2,7 @@
 
 import gc
 import signal
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -44,18 +45,24 @@ def world(
             physics=settings.physics or "pybullet",
         )
         log = TruthLog(plant, None if truth is None else EVERY_TICKS)
-        server = BusServer(bus, log, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
+        server = BusServer(bus, log, PATIENCE_S, report=_say)
     except OSError as error:
         raise UsageError(str(error)) from error
-    typer.echo(f"{robot.name}: {len(plant.modules)} modules on {bus}", err=True)
+    _say(f"{robot.name}: {len(plant.modules)} modules on {bus}")
     # A full collection of what the imports have left would stop all modules' ticks.
     gc.collect()
     gc.freeze()
     with server:
         report = server.run(settings.speed, lambda: bool(stopping))
-    typer.echo(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time", err=True)
+    _say(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time")
     if truth is not None:
         truth.mkdir(parents=True, exist_ok=True)
         write_truth(truth / "truth.json", robot, plant)
         log.save(truth / "truth.npz")
     plant.close()
+
+
+def _say(text: str) -> None:
+    """Print a line on standard error; a full disk or a closed terminal there does not end the world."""
+    with suppress(OSError):
+        typer.echo(text, err=True)

@@ -16,7 +16,7 @@ import numpy as np
 from module_agent.transport.transport import Event, Sample, Transport
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import unpack
-from module_agent.wire.keys import ROOT, Leaf, key
+from module_agent.wire.keys import ROOT, Leaf, every, key
 from module_agent.wire.messages import SCHEMA_VERSION, Feedback
 from module_agent.wire.refusal import WireError
 
@@ -51,7 +51,9 @@ class Intruder:
         self._sent = 0
         self._aside_rad = ASIDE_RAD
         self._declared = False
-        transport.subscribe(key(robot, serial, Leaf.STATUS), self._hear)
+        # Serials of modules that were heard, in the order of their first status.
+        self._modules: dict[str, None] = {}
+        transport.subscribe(every(robot, Leaf.STATUS), self._hear)
         transport.subscribe(key(robot, serial, Leaf.FEEDBACK), self._hear_rows)
 
     def overhear(self, leaf: Leaf, payload: bytes) -> None:
@@ -72,7 +74,10 @@ class Intruder:
                 heard = msgpack.unpackb(event.payload)
             except ValueError:
                 return
-            if isinstance(heard, dict) and heard.get("serial") == self._serial:
+            if not isinstance(heard, dict):
+                return
+            self._modules[str(heard.get("serial"))] = None
+            if heard.get("serial") == self._serial:
                 self._status = heard
 
     def _hear_rows(self, event: Event) -> None:
@@ -90,14 +95,26 @@ class Intruder:
         self._transport.query(at, payload, 0.5, lambda event: None, self._sent)
 
     def poison(self) -> None:
-        """Publish statuses of a module that cannot be, and of a motion without end."""
+        """Publish statuses of a module that cannot be, of motions without end, and estimates of none."""
         record = {"motion_id": 1, "pattern": {"kind": "rest", "duration_s": 1.0}, "outcome": "running"}
         rows = {"start_ns": 0, "start_row": 0, "end_row": HUGE, "origin_rad": 0.0}
+        # The one that it has, as if it were done already.
+        endless = (self._status.get("motion") or record | rows) | {"outcome": "done", "end_row": None}
+        wrong_motions = {"motion": record | rows}, {"motion": endless}
         # Coordinators hear the one key, the other modules the other.
         for leaf in (Leaf.STATUS, Leaf.MOTION):
-            for wrong in ({"serial": "-bad"}, {"next_row": HUGE}, {"motion": record | rows}, {"t_ns": -HUGE}):
+            for wrong in ({"serial": "-bad"}, {"next_row": HUGE}, *wrong_motions, {"t_ns": -HUGE}):
                 self._publish(key(self._robot, self._serial, leaf), self._status | wrong)
             self._publish(f"{ROOT}/{self._robot}/-bad/{leaf.value}", self._status | {"serial": "-bad"})
+        for joint in list(self._modules):
+            self._publish(key(self._robot, self._serial, Leaf.ESTIMATE), self._estimate_of(joint))
+
+    def _estimate_of(self, joint: str) -> dict[str, Any]:
+        """Return an estimate of a joint by the module, from no motion at all."""
+        head = {name: self._status.get(name, 0) for name in ("boot", "seq", "t_ns")}
+        nothing = {"motion_ids": (), "moved": True, "rate_ratio": 1.0, "circle": None, "regression": None}
+        body = {"joint": joint, "gravity_m_s2": (0.0, 0.0, 9.81), "note": ""}
+        return {"v": SCHEMA_VERSION, "serial": self._serial} | head | nothing | body
 
     def impersonate(self) -> None:
         """Command in the holder's name, as a module publishes it, what the module's limits allow.

@@ -132,6 +132,7 @@ class BusServer:
         self._listener = _listen(path)
         self._poll.register(self._listener, select.POLLIN)
         self._before_hello: set[int] = set()
+        self._is_full = False
 
     @property
     def ticks(self) -> int:
@@ -318,7 +319,15 @@ class BusServer:
     def _attend(self, descriptor: int) -> None:
         """Serve what is ready outside the barrier: a new connection, a hello, or an answer long due."""
         if descriptor == self._listener.fileno():
-            connection, _ = self._listener.accept()
+            try:
+                connection, _ = self._listener.accept()
+            except OSError as error:
+                # Those who are silent for too long make room.
+                if not self._is_full:
+                    self._report(f"no more processes can attach for now: {error.strerror}")
+                self._is_full = True
+                return
+            self._is_full = False
             _set_receive_timeout(connection, self._bound_s)
             self._outside[connection.fileno()] = _Agent(connection)
             self._before_hello.add(connection.fileno())

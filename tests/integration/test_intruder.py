@@ -30,6 +30,7 @@ from module_agent.wire.messages import Ack, Feedback, LeaseRequest, Setpoint, St
 from module_agent.wire.refusal import WireError
 from sim.faults.intruder import HUGE, Intruder
 from sim.faults.invariants import RESOLUTION_MM, SIGMAS
+from sim.robot.robot_file import load_robot
 from sim.scoring.score import score
 from sim.world.truth import read_motion
 
@@ -261,7 +262,13 @@ def lie(module, status: bytes) -> None:
     record = {"motion_id": 1, "pattern": {"kind": "rest", "duration_s": 1.0}, "outcome": "running"}
     rows = {"start_ns": 0, "start_row": 0, "end_row": HUGE, "origin_rad": 0.0}
     whole = {"start_ns": 0, "start_row": 0, "end_row": 90_000, "origin_rad": 0.0, "outcome": "done"}
-    lies = {"motion": record | rows}, {"motion": record | whole}, {"next_row": HUGE}, {"t_ns": -HUGE}
+    endless = {"motion": record | whole | {"end_row": None}}
+    lies = {"motion": record | rows}, {"motion": record | whole}, endless, {"next_row": HUGE}, {"t_ns": -HUGE}
+    estimate = msgpack.unpackb(status) | {"serial": "INTRUDER", "motion_ids": (), "moved": True, "note": ""}
+    estimate |= {"rate_ratio": 1.0, "gravity_m_s2": (0.0, 0.0, 9.81), "circle": None, "regression": None}
+    for joint in load_robot(ROBOT).serials:
+        told = msgpack.packb(estimate | {"joint": joint})
+        module.publish(key(ROBOT, "INTRUDER", Leaf.ESTIMATE), told)
     for leaf in (Leaf.STATUS, Leaf.MOTION):
         for wrong in lies:
             told = msgpack.unpackb(status) | {"serial": "INTRUDER"} | wrong

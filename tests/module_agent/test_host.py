@@ -8,6 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from module_agent.host import InlineWorker
 from module_agent.transport.inbox import EVENT_BYTES
 from module_agent.transport.transport import Liveness, Reply, Sample
 from module_agent.wire.codec import decode, encode
@@ -122,6 +123,44 @@ def test_a_motion_of_a_single_tick_does_not_end_the_agents(rigs: Callable[..., A
     # Whether a row fell into it or not, nothing can be told from it, and that is said.
     assert notes
     assert all(notes)
+
+
+def test_motions_that_are_announced_faster_than_they_are_analysed_are_left_out(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rows of those that wait are bounded, and there is room again when they are done."""
+    monkeypatch.setattr("module_agent.host.MAX_WAITING_ROWS", 30)
+    rig = rigs(ARM)
+    _, _, group = rig.group()
+    host, waiting = rig.hosts[TIP], list[tuple[Any, Any]]()
+
+    class Busy(InlineWorker):
+        """A worker that gets to nothing."""
+
+        def submit(self, job: Any, done: Any) -> None:
+            waiting.append((job, done))
+
+    host.worker = Busy()
+
+    async def moved(times: int) -> None:
+        for _ in range(times):
+            blink = ConstantMotion(velocity_rad_s=0.1, duration_s=0.08, ramp_s=0.0)
+            assert (await group.run({BASE: blink}))[BASE].outcome == "done"
+        await asyncio.sleep(0.5)
+
+    async def work() -> None:
+        await asyncio.sleep(0.1)
+        await group.meet([BASE, TIP])
+        await group.acquire(BASE)
+        await moved(4)
+        assert len(waiting) == 1
+        assert host.modules[0].firmware.admission.refusals["limit"] == 3
+        job, done = waiting.pop()
+        done(job())
+        await moved(1)
+        assert len(waiting) == 1
+
+    rig.run(work())
 
 
 def _answers(rig: Any, leaf: Leaf, payload: bytes, serial: str = BASE) -> bytes:

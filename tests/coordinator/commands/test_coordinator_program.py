@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from coordinator.commands.run import resuming
-from coordinator.live_robot.discovery import Search, listed, stop_robot
+from coordinator.live_robot.discovery import Search, light_led, listed, stop_robot
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.live_robot.messenger import NoAnswer
 from coordinator.main import app
@@ -27,7 +28,7 @@ from coordinator.runtime.event_loop import Interruption, run_to_end
 from coordinator.synchronisation.feedback_delays import feedback_delays
 from coordinator.viewer.targets import ViewerTargets, viewer_choice
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
-from module_agent.model.errors import EXIT_USAGE, UsageError
+from module_agent.model.errors import EXIT_USAGE, RobotError, UsageError
 from module_agent.transport.transport import Event, Liveness, Reply, Sample, Sink
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
@@ -333,7 +334,68 @@ def test_the_delay_of_feedback_is_heard_meanwhile(wire: Any) -> None:
 def test_every_module_is_stopped_and_who_does_not_confirm_is_named(wire: Any) -> None:
     robot: Any = Robot(wire, ("B", "A", "C"), deaf=("C",))
     assert stop_robot(robot, "arm", "tester", QUICK) == (["A", "B"], ["C"])
-    assert robot.stopped == ["A", "B"]
+    # In the order in which they were seen, and not when all were.
+    assert robot.stopped == ["B", "A"]
+
+
+def test_a_stop_does_not_wait_for_a_module_that_comes_and_goes(
+    wire: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A module announces itself and leaves all the time, so that the search for others takes its longest."""
+    monkeypatch.setattr("coordinator.live_robot.discovery.MAX_S", 1.5)
+    sent_s: list[float] = []
+
+    class Restless(Robot):
+        """A network with a module that never settles."""
+
+        def watch_alive(self, key_expr: str, sink: Sink) -> "Robot":
+            super().watch_alive(key_expr, sink)
+            self.left = threading.Event()
+            self.thread = threading.Thread(target=self.come_and_go, args=(sink,))
+            self.thread.start()
+            return self
+
+        def come_and_go(self, sink: Sink) -> None:
+            alive = True
+            while not self.left.wait(0.01):
+                sink(Liveness(key("arm", "RESTLESS", Leaf.ALIVE), alive))
+                alive = not alive
+
+        def undeclare(self) -> None:
+            self.left.set()
+            self.thread.join()
+
+        def answer(self, serial: str, at: str, payload: bytes) -> bytes:
+            sent_s.append(time.monotonic() - begun_s)
+            return super().answer(serial, at, payload)
+
+    robot: Any = Restless(wire, ("B", "A"))
+    begun_s = time.monotonic()
+    stopped, _ = stop_robot(robot, "arm", "tester", QUICK._replace(quiet_s=0.2))
+    assert time.monotonic() - begun_s > 1.0
+    assert {"A", "B"} <= {*stopped}
+    assert sent_s[0] < 0.5
+    assert sent_s[1] < 0.5
+
+
+def test_a_led_is_lit_only_if_the_module_itself_says_so(wire: Any) -> None:
+    class Answering(Robot):
+        """Its module answers as another one, another question, or garbage."""
+
+        def answer(self, serial: str, at: str, payload: bytes) -> bytes:
+            return answers.pop(0)
+
+    right = encode(wire.ack(serial="A", re=1))
+    answers = [right, encode(wire.ack(serial="B", re=1)), encode(wire.ack(serial="A", re=7)), b"garbage"]
+    robot: Any = Answering(wire, ("A",))
+    light_led(robot, "arm", "A", "tester", True, QUICK)
+    for said in (
+        "is no answer to the question: B, 1",
+        "is no answer to the question: A, 7",
+        "cannot be read",
+    ):
+        with pytest.raises(RobotError, match=said):
+            light_led(robot, "arm", "A", "tester", True, QUICK)
 
 
 @pytest.mark.parametrize(("lost", "stops"), [(2, True), (3, False)])

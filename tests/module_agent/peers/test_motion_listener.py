@@ -336,7 +336,7 @@ def test_modules_and_boots_that_were_made_up_are_remembered_up_to_a_bound() -> N
     for number in range(5000):
         listener.on_status(_status(None, boot=number), 0, OWN)
         try:
-            listener.on_status(_status(_record(end=None), serial=f"M{number}"), 0, OWN)
+            listener.on_status(_status(_record(end=None, outcome="running"), serial=f"M{number}"), 0, OWN)
         except WireError:
             refused += 1
     assert len(listener._newest) == MAX_BOOTS
@@ -349,7 +349,7 @@ def test_modules_and_boots_that_were_made_up_are_remembered_up_to_a_bound() -> N
 def test_modules_that_were_made_up_do_not_keep_others_out_for_ever() -> None:
     listener = MotionListener()
     for number in range(MAX_MODULES):
-        listener.on_status(_status(_record(end=None), serial=f"M{number}"), 0, OWN)
+        listener.on_status(_status(_record(end=None, outcome="running"), serial=f"M{number}"), 0, OWN)
     with pytest.raises(WireError, match="J is one module more"):
         listener.on_status(_status(_record()), 1, OWN)
     listener.poll(FORGET_NS)
@@ -378,9 +378,13 @@ def test_a_module_that_was_forgotten_is_heard_again_and_its_old_words_are_not() 
     assert "M" not in listener._boot
     later = 3 * FORGET_NS
     for boot in (6, 7):
-        listener.on_status(_status(_record(2, end=None), seq=3, serial="M", boot=boot), later, OWN)
+        listener.on_status(
+            _status(_record(2, end=None, outcome="running"), seq=3, serial="M", boot=boot), later, OWN
+        )
     assert "M" not in listener._tracks
-    listener.on_status(_status(_record(2, end=None), seq=4, serial="M", boot=7), later, OWN)
+    listener.on_status(
+        _status(_record(2, end=None, outcome="running"), seq=4, serial="M", boot=7), later, OWN
+    )
     assert listener._tracks["M"].record.motion_id == 2
 
 

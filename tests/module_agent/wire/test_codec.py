@@ -399,6 +399,35 @@ def test_no_bytes_whatever_raise_anything_but_a_wire_error(data: bytes) -> None:
             decode(kind, data)
 
 
+def _examples(kind: type[Message]) -> dict[str, Any]:
+    """The first example of a kind, as plain msgpack has it."""
+    found: dict[str, Any] = msgpack.unpackb(encode(next(one for one in EXAMPLES if type(one) is kind)))
+    return found
+
+
+def test_an_estimate_is_of_a_motion_at_least() -> None:
+    wrong = msgpack.packb(_examples(Estimate) | {"motion_ids": ()})
+    with pytest.raises(WireError, match="motion_ids"):
+        decode(Estimate, wrong)
+
+
+def test_a_motion_that_is_done_has_its_last_row() -> None:
+    status = _examples(Status)
+    assert status["motion"]["outcome"] == "running"
+    decode(Status, msgpack.packb(status | {"motion": status["motion"] | {"end_row": None}}))
+    done = status | {"motion": status["motion"] | {"outcome": "done", "end_row": None}}
+    with pytest.raises(WireError, match="is done and has no last row"):
+        decode(Status, msgpack.packb(done))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"), [({"part": b""}, "part"), ({"offset": 9}, "8 bytes from 9 on are beyond the 16")]
+)
+def test_a_part_of_information_is_something_within_its_block(wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(WireError, match=said):
+        decode(Information, msgpack.packb(_examples(Information) | wrong))
+
+
 def test_a_block_that_is_shorter_than_announced_is_refused() -> None:
     whole = Feedback(**HEAD, first_row=0, count=3, rows=rows(2).tobytes())
     with pytest.raises(WireError, match="3 rows"):

@@ -64,6 +64,14 @@ def test_a_clock_that_stood_before_the_motion_that_counts_is_named() -> None:
     assert (found.violations, found.named_rightly) == ({}, True)
 
 
+@pytest.mark.parametrize(("seed", "planned"), [(5, "short"), (13, "simultaneous")])
+def test_no_packet_of_an_intruder_ends_a_session(seed: int, planned: schedule.PlanName) -> None:
+    """Estimates of no motion, and motions that are done without an end, ended the coordinator once."""
+    one = draw(seed, planned=planned)
+    found = run_seed(one._replace(faults=(Fault("intruder", 1.0, 30.0, 0, 0.05),)), shrinks=False)
+    assert (found.violations, found.outcome) == ({}, "right")
+
+
 def test_where_the_fit_leaves_a_module_out_no_agent_is_asked_about_its_motions(tmp_path: Path) -> None:
     """A joint is held in its slow motion and later; the module that it carries contradicts all others."""
     stall = Fault("motor stall", 7.939, math.inf, 1, 0.553)

@@ -319,6 +319,32 @@ def test_a_connection_that_says_nothing_is_dropped_and_holds_nobody_up(path, mon
     assert lines == ["an agent before its hello is dropped: no hello within 0.05 s"]
 
 
+def test_where_no_more_connections_fit_the_world_goes_on_and_says_so_once(path, monkeypatch) -> None:
+    class Full:
+        """A process that has no descriptor left."""
+
+        def __init__(self, listener) -> None:
+            self._listener = listener
+
+        def accept(self):
+            raise OSError(24, "Too many open files")
+
+        def __getattr__(self, name: str):
+            return getattr(self._listener, name)
+
+    lines: list[str] = []
+    with (
+        BusServer(path, EchoWorld(["A"]), report=lines.append) as server,
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as caller,
+    ):
+        monkeypatch.setattr(server, "_listener", Full(server._listener))
+        caller.connect(path)
+        tick_until(server, lambda: bool(lines))
+        ticks = server.ticks
+        tick_until(server, lambda: server.ticks > ticks + 3)
+    assert lines == ["no more processes can attach for now: Too many open files"]
+
+
 def test_modules_of_an_agent_that_does_not_answer_go_to_the_next_that_asks(path, monkeypatch) -> None:
     monkeypatch.setattr(bus_server, "ABANDONED_S", 0.3)
     lines: list[str] = []
