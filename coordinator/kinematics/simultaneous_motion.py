@@ -94,11 +94,18 @@ def simultaneous_response(
         bandwidth_hz: of their low-pass; there are 2 bandwidth / rate as many independent samples.
 
     Raises:
-        DataError: a joint hardly turned, or two joints cannot be told apart; they are named.
+        DataError: a joint hardly turned, or two joints cannot be told apart; they are named. Or all modules
+            have too few samples at the same times.
     """
+    samples, count = data.q_rad.shape
+    # More than the unknowns of each regression, which are as many as pairs of joints, and some.
+    if samples < (needed := 2 * (count + 1) ** 2):
+        raise DataError(
+            f"all modules together have {samples} samples of the motion of all joints, at least {needed} are "
+            "needed: a clock is wrong, or rows are missing"
+        )
     _check_told_apart(serials, data.qd_rad_s)
     independent = min(1.0, 2.0 * bandwidth_hz / rate_hz)
-    samples, count = data.q_rad.shape
     gyro = data.gyro_rad_s - still.gyro_rad_s
     q, qd, one = data.q_rad, data.qd_rad_s, np.ones(samples)
     swing = q - q.mean(axis=0)

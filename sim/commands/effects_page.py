@@ -36,7 +36,8 @@ Every effect can be switched on its own: `--with NAME` and `--without NAME` of `
 `world`. A noise profile (`--noise`) is a set of them: `ideal` has perfect sensors on a rigid robot, `x5` is a
 module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has all of them, and
 larger ones. Sizes are one standard deviation where they differ between modules or samples, unless the model
-says otherwise; they are drawn once per module from the seed. The network is chosen by
+says otherwise; they are drawn once per module from the seed. The default size is that of `x5-uncalibrated`; a
+profile with another one has it in brackets. The network is chosen by
 `--network NAME|FILE`, the robot's structure is in its file. `x5-sim effects` prints the same table.
 
 """
@@ -54,8 +55,7 @@ def effects(
     if write_result(json_file, rows):
         table = new_table(None, "effect | part | model | size | in the profiles", show_lines=True)
         for name, effect in EFFECTS.items():
-            profiles = ", ".join(profiles_with(effect))
-            table.add_row(name, effect.part, effect.model, default_size(effect), profiles)
+            table.add_row(name, effect.part, effect.model, default_size(effect), profiles_and_sizes(effect))
         print_table(table)
 
 
@@ -74,6 +74,15 @@ def sizes(effect: Effect, profile: NoiseProfile) -> str:
 def profiles_with(effect: Effect) -> list[str]:
     """Return the names of the profiles that have an effect."""
     return [name for name, profile in NOISE_PROFILES.items() if sizes(effect, profile) != OFF]
+
+
+def profiles_and_sizes(effect: Effect) -> str:
+    """Return the names of the profiles that have an effect, each with its sizes if they are others."""
+    usual, names = default_size(effect).removeprefix(f"{OFF}; switched on: "), []
+    for name in profiles_with(effect):
+        size = sizes(effect, NOISE_PROFILES[name])
+        names.append(name if size == usual else f"{name} ({size})")
+    return ", ".join(names)
 
 
 def _always() -> str:
@@ -142,7 +151,7 @@ def _table(part: str) -> str:
     rows = []
     for name, effect in EFFECTS.items():
         if effect.part == part:
-            title, where = name.replace("-", " ").replace("imu", "IMU"), ", ".join(profiles_with(effect))
+            title, where = name.replace("-", " ").replace("imu", "IMU"), profiles_and_sizes(effect)
             cells = (title, effect.model, default_size(effect), where, effect.source, f"`{name}`")
             rows.append(" | ".join(cells))
     columns = "effect | model | default size | profiles | source | switch"

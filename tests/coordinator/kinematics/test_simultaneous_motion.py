@@ -149,3 +149,14 @@ def test_a_joint_that_did_not_turn_is_named() -> None:
     data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
     with pytest.raises(DataError, match=r"joint B turned at only 0 rad/s"):
         simultaneous_response("ABC", data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
+
+
+@pytest.mark.parametrize("samples", [0, 1, 31])
+def test_modules_that_have_hardly_a_sample_at_the_same_times_are_no_response(
+    robots: SimpleNamespace, samples: int
+) -> None:
+    chain, _ = robots.random(1, joints=3)
+    data, still = moved(chain, 1)
+    few = SimultaneousMotion(*(part[:samples] for part in data))
+    with pytest.raises(DataError, match=f"have {samples} samples of the motion of all joints, at least 32"):
+        simultaneous_response(chain.serials, few, still, RATE_HZ, 15.0)
