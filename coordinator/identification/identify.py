@@ -62,6 +62,7 @@ from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
 from coordinator.synchronisation.motion_windows import (
     INDEPENDENT_FRACTION,
+    RATE_HZ,
     Window,
     dynamic_windows,
     filtered_window,
@@ -78,7 +79,12 @@ from module_agent.model.errors import DataError
 from module_agent.model.files import replacing
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import NS_PER_S, REFINEMENT_CUTOFF_HZ, JointMotion
+from module_agent.signals.filtering import (
+    NS_PER_S,
+    REFINEMENT_CUTOFF_HZ,
+    JointMotion,
+    settling_samples,
+)
 
 # The largest of some 30 IMU errors, in standard deviations, is below this for 99 of 100 IMUs.
 OUTLIER_ABOVE = 3.5
@@ -413,10 +419,21 @@ def _imu_rate_hz(recording: Recording, serial: str) -> float:
 
 
 def _rest(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> Window:
-    """Return the longest stretch of rest without holes."""
+    """Return the longest stretch of rest without holes.
+
+    Raises:
+        DataError: it is too short for the noise of the sensors to be told.
+    """
     still = [e for e in recording.latest_motions("rest") if e.serial == serials[0]]
-    parts = unbroken_windows(recording, clocks, serials, still[0])
-    return max(parts, key=lambda part: len(part.t_ns))
+    longest = max(unbroken_windows(recording, clocks, serials, still[0]), key=lambda part: len(part.t_ns))
+    # The low-pass settles at either end.
+    needed = 2 * settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) + MIN_REST_ROWS
+    if len(longest.t_ns) < needed:
+        raise DataError(
+            f"all modules together have {len(longest.t_ns) / RATE_HZ:.2g} s of rest without a hole, at least "
+            f"{needed / RATE_HZ:.2g} s are needed: rows are missing, or a clock is wrong"
+        )
+    return longest
 
 
 def _moving(recording: Recording) -> list[JournalEvent]:

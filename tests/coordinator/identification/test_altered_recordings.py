@@ -14,6 +14,7 @@ from coordinator.identification.robot_refinement import refine_checked
 from coordinator.recording.journal import JournalEvent, exclusion_event
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.session_file import read_session
+from coordinator.synchronisation.motion_windows import unbroken_windows
 from module_agent.model.errors import EXIT_SUSPECT
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import ROW, Rows
@@ -375,3 +376,19 @@ def test_a_leaf_that_counts_backwards_is_refused_by_its_motor(run: list[Entry]) 
     # Nothing is beyond it that would show the sign.
     with pytest.raises(IdentificationError, match=rf"{ELBOW}: its motor's speed over its joint's is -7"):
         identify_kinematics(_altered(run, _backwards(ELBOW, ENCODER)))
+
+
+def test_modules_that_hardly_rested_at_the_same_times_are_said_so(
+    run: list[Entry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The low-pass settles within 0.17 s at either end, so that nothing is left of 0.3 s to tell noise by."""
+
+    def shortened(recording: Recording, clocks: Any, serials: Any, event: JournalEvent, *more: Any) -> Any:
+        windows = unbroken_windows(recording, clocks, serials, event, *more)
+        return [one._replace(t_ns=one.t_ns[:75]) for one in windows] if event.purpose == "rest" else windows
+
+    monkeypatch.setattr("coordinator.identification.identify.unbroken_windows", shortened)
+    with pytest.raises(
+        IdentificationError, match=r"have 0\.3 s of rest without a hole, at least 0\.38 s are"
+    ):
+        identify_kinematics(_altered(run, lambda *_: None))
