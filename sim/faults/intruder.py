@@ -83,8 +83,9 @@ class Intruder:
     def _hear_rows(self, event: Event) -> None:
         if isinstance(event, Sample):
             with suppress(WireError):
-                newest = unpack(decode(Feedback, event.payload, MAX_MESSAGE_BYTES))[-1]
-                self._seen = int(newest["t_ns"]), float(newest["position_rad"])
+                rows = unpack(decode(Feedback, event.payload, MAX_MESSAGE_BYTES))
+                if len(rows):
+                    self._seen = int(rows["t_ns"][-1]), float(rows["position_rad"][-1])
 
     def _publish(self, at: str, message: dict[str, Any]) -> None:
         self._transport.publish(at, msgpack.packb(message))
