@@ -4,10 +4,7 @@ Where nothing on the network tells who spoke, forged messages may stop a session
 documentation of security. None may end a program by a defect.
 """
 
-import copy
-import math
 import random
-from collections.abc import Iterator
 from typing import Any
 
 import msgpack
@@ -20,29 +17,7 @@ from sim.faults.fault import Fault
 from sim.faults.report import run_seed
 from sim.faults.schedule import draw
 from tests.breadth import breadth
-
-# What a field may hold instead, by its type or of any other.
-EXTREMES: tuple[Any, ...] = (
-    *(0, 1, -1, 2**31, 2**53, 2**62, -(2**62)),
-    *(0.0, 1e-300, 1e300, -1e300, 1e9, math.nan, math.inf),
-    *("", "x", b"", None, [], {}, True, False),
-)
-# Of fields whose extremes are refused at once, what is not.
-WORDS = {
-    "outcome": ("running", "done", "superseded", "stopped", "expired", "fault"),
-    "state": ("idle", "armed", "moving", "streaming", "expired", "stopped", "fault"),
-}
-HEAD = ("v", "serial", "boot")
-
-
-def fields(message: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Yield the paths of all fields of a message, those of its parts too."""
-    inside = message.items() if isinstance(message, dict) else enumerate(message[:8])
-    for name, value in inside:
-        if path or name not in HEAD:
-            yield (*path, name)
-            if isinstance(value, dict | list):
-                yield from fields(value, (*path, name))
+from tests.forgery import altered
 
 
 class Forger:
@@ -62,25 +37,11 @@ class Forger:
                 own._transport.subscribe(every(own._robot, leaf), self._hear)
         self.sent += 1
         for at in self._draw.sample(list(self._newest), min(2, len(self._newest))):
-            own._publish(at, self._altered(self._newest[at]))
+            own._publish(at, altered(self._newest[at], self._draw))
 
     def _hear(self, event: Event) -> None:
         if isinstance(event, Sample):
             self._newest[event.key] = msgpack.unpackb(event.payload)
-
-    def _altered(self, message: dict[str, Any]) -> dict[str, Any]:
-        draw, forged = self._draw, copy.deepcopy(message)
-        *above, name = draw.choice(list(fields(forged)))
-        part: Any = forged
-        for step in above:
-            part = part[step]
-        old = part[name]
-        alike = [value for value in EXTREMES if type(value) is type(old)]
-        new = draw.choice(alike if alike and draw.random() < 0.7 else EXTREMES)
-        if isinstance(old, int | float) and draw.random() < 0.5:
-            new = old + draw.choice((1, -1, 10, 100, -100))
-        part[name] = draw.choice(WORDS[name]) if name in WORDS else new
-        return forged
 
 
 @pytest.mark.parametrize("seed", [8, 10, 14, 19, *breadth(*range(20, 50))])
