@@ -50,8 +50,9 @@ from module_agent.wire.topics import PUBLISHED_TO_MODULE, SERVED, TOPICS
 HISTORY_TIMEOUT_S = 0.4
 # A question whose answer is dropped on arrival would otherwise be remembered for ever.
 MAX_ASKED = 1024
-# So many rows of motions may wait for their estimates: of 64 joints that moved at once for two minutes.
-MAX_WAITING_ROWS = 2_000_000
+# So many rows of motions may wait for their estimates: of 64 joints that moved at once for two minutes. The
+# shortest motion counts as so many, as a job has a size by itself.
+MAX_WAITING_ROWS, MIN_ROWS = 2_000_000, 100
 
 T = TypeVar("T")
 M = TypeVar("M", Status, Feedback, Ack)
@@ -394,7 +395,7 @@ class AgentHost:
             else:
                 self._ask_history(wanted)
         for motion in motions:
-            rows = len(motion.rows)
+            rows = max(len(motion.rows), MIN_ROWS)
             if self._waiting_rows + rows > MAX_WAITING_ROWS:
                 # Motions are announced faster than they can have been made.
                 for module in self.modules:

@@ -297,17 +297,15 @@ async def _stop_all(transport: Transport, robot: str, sender: str, search: Searc
             return False
         return True
 
-    def see(event: Event) -> None:
-        serial = presence.take(event)
+    events = _Arrivals()
+    declared = transport.watch_alive(every(robot, Leaf.ALIVE), events.put)
+    while not presence.is_complete and time.monotonic() < presence.until_s:
+        arrived = events.get(0.0)
+        serial = presence.take(arrived[1]) if arrived is not None else None
         if serial is not None and serial not in stops:
             stops[serial] = asyncio.create_task(confirms(serial))
-
-    def sink(event: Event) -> None:
-        post(see, event)
-
-    declared = transport.watch_alive(every(robot, Leaf.ALIVE), sink)
-    while not presence.is_complete and time.monotonic() < presence.until_s:
-        await asyncio.sleep(POLL_S)
+        # Between two tokens the stops of those before go out.
+        await asyncio.sleep(POLL_S if arrived is None else 0.0)
     declared.undeclare()
     confirmed = {serial: await stops[serial] for serial in sorted(stops)}
     there = {*presence.serials}

@@ -129,7 +129,7 @@ def test_motions_that_are_announced_faster_than_they_are_analysed_are_left_out(
     rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rows of those that wait are bounded, and there is room again when they are done."""
-    monkeypatch.setattr("module_agent.host.MAX_WAITING_ROWS", 30)
+    monkeypatch.setattr("module_agent.host.MAX_WAITING_ROWS", 150)
     rig = rigs(ARM)
     _, _, group = rig.group()
     host, waiting = rig.hosts[TIP], list[tuple[Any, Any]]()
