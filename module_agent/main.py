@@ -308,16 +308,20 @@ def _list(library: str) -> None:
         raise typer.Exit(EXIT_FAILED)
 
 
+def _say(text: str) -> None:
+    """Print a line on standard error; a closed terminal or full disk there does not end the agent."""
+    with suppress(OSError):
+        typer.echo(text, err=True)
+
+
 def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
     names = ", ".join(module.serial for module in host.modules)
     try:
-        # A closed terminal, or a log on a full disk, is no reason to leave the modules.
-        with suppress(OSError):
-            typer.echo(f"x5-agent: {names}: {ATTACHED}, process {os.getpid()}", err=True)
+        _say(f"x5-agent: {names}: {ATTACHED}, process {os.getpid()}")
         while True:
             host.cycle()
     except HardwareLost as error:
-        typer.echo(f"x5-agent: {names}: the modules are gone: {error}", err=True)
+        _say(f"x5-agent: {names}: the modules are gone: {error}")
         raise typer.Exit(EXIT_LOST) from error
     finally:
         # The end of the world is mostly followed by a signal that ends the agents too: one in the middle of

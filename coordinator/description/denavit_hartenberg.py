@@ -68,13 +68,13 @@ def dh_path(chain: Chain, leaf: int) -> DhPath:
         axis, point = chain.axis[following], chain.point[following]
         sine = float(np.linalg.norm(np.cross(frame[:3, 2], axis)))
         step = _hayati if sine < np.sin(NEARLY_PARALLEL_RAD) else _by_common_normal
-        row, frame = step(frame, axis, point)
-        rows.append(row._replace(serial=chain.serials[joint]))
+        row, frame = step(chain.serials[joint], frame, axis, point)
+        rows.append(row)
     rows.append(DhRow(chain.serials[path[-1]], 0.0, 0.0, 0.0, 0.0))
     return DhPath(base, tuple(rows))
 
 
-def _by_common_normal(frame: Array, axis: Array, point: Array) -> tuple[DhRow, Array]:
+def _by_common_normal(serial: str, frame: Array, axis: Array, point: Array) -> tuple[DhRow, Array]:
     """Return the row from a frame to the next axis by their common normal, and the next frame."""
     x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
     cross, between = np.cross(z, axis), point - origin
@@ -85,11 +85,11 @@ def _by_common_normal(frame: Array, axis: Array, point: Array) -> tuple[DhRow, A
     # From the first axis to the second, so that a >= 0; of axes that meet either direction will do.
     normal = -normal if float((along - foot) @ normal) < 0.0 else normal
     d_m, a_m = float((foot - origin) @ z), float((along - foot) @ normal)
-    row = DhRow("", _angle(x, normal, z), d_m, a_m, _angle(z, axis, normal))
+    row = DhRow(serial, _angle(x, normal, z), d_m, a_m, _angle(z, axis, normal))
     return row, _frame(axis, normal, along)
 
 
-def _hayati(frame: Array, axis: Array, point: Array) -> tuple[DhRow, Array]:
+def _hayati(serial: str, frame: Array, axis: Array, point: Array) -> tuple[DhRow, Array]:
     """Return the row from a frame to the next axis, which is nearly parallel to its z, and the next frame."""
     x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
     met = point + axis * float(z @ (origin - point)) / float(z @ axis)
@@ -102,7 +102,7 @@ def _hayati(frame: Array, axis: Array, point: Array) -> tuple[DhRow, Array]:
     alpha += 2.0 * np.pi if alpha < -0.5 * np.pi else 0.0
     following = between.copy()
     following[:3, :3] = between[:3, :3] @ Rotation.from_euler("XY", [alpha, beta]).as_matrix()
-    return DhRow("", _angle(x, towards, z), 0.0, a_m, alpha, beta), following
+    return DhRow(serial, _angle(x, towards, z), 0.0, a_m, alpha, beta), following
 
 
 def _angle(start: Array, end: Array, about: Array) -> float:

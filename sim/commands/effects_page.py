@@ -78,11 +78,9 @@ def profiles_with(effect: Effect) -> list[str]:
 
 def profiles_and_sizes(effect: Effect) -> str:
     """Return the names of the profiles that have an effect, each with its sizes if they are others."""
-    usual, names = default_size(effect).removeprefix(f"{OFF}; switched on: "), []
-    for name in profiles_with(effect):
-        size = sizes(effect, NOISE_PROFILES[name])
-        names.append(name if size == usual else f"{name} ({size})")
-    return ", ".join(names)
+    each = {name: sizes(effect, NOISE_PROFILES[name]) for name in profiles_with(effect)}
+    usual = usual_size(effect)
+    return ", ".join(name if size == usual else f"{name} ({size})" for name, size in each.items())
 
 
 def _always() -> str:
@@ -140,11 +138,15 @@ def _section(title: str, columns: str, rows: Iterable[str]) -> str:
 
 def default_size(effect: Effect) -> str:
     """Return an effect's sizes in the default profile; where it is off there, those that the switch gives."""
+    is_on = sizes(effect, NOISE_PROFILES[DEFAULT_PROFILE]) != OFF
+    return usual_size(effect) if is_on else f"{OFF}; switched on: {usual_size(effect)}"
+
+
+def usual_size(effect: Effect) -> str:
+    """Return an effect's sizes in the default profile with the effect."""
     profile = NOISE_PROFILES[DEFAULT_PROFILE]
     size = sizes(effect, profile)
-    if size != OFF:
-        return size
-    return f"{OFF}; switched on: {sizes(effect, profile.model_copy(update=dict(effect.sizes)))}"
+    return size if size != OFF else sizes(effect, profile.model_copy(update=dict(effect.sizes)))
 
 
 def _table(part: str) -> str:

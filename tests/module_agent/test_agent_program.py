@@ -1,6 +1,7 @@
 """What `x5-agent` says when it cannot work; only a hub that is not there yet is waited for."""
 
 import ctypes
+import io
 import os
 import signal
 import socket
@@ -240,4 +241,31 @@ def test_a_signal_in_the_middle_of_closing_does_not_leave_an_agent_half_closed(
         for each, handler in before.items():
             signal.signal(each, handler)
     assert host.closed
+    assert ended.value.exit_code == EXIT_LOST
+
+
+def test_an_agent_runs_on_where_nothing_can_be_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standard error is a log on a full disk."""
+    done: list[str] = []
+
+    def cycle() -> None:
+        done.append("cycle")
+        if done.count("cycle") == 3:
+            raise HardwareLost("the world has ended")
+
+    host: Any = SimpleNamespace(
+        modules=[SimpleNamespace(serial="A")], cycle=cycle, close=lambda: done.append("close")
+    )
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    # Line by line, as standard error is, so that a flush at its end has nothing left to write.
+    disk = io.TextIOWrapper(io.FileIO("/dev/full", "w"), write_through=True)
+    try:
+        with monkeypatch.context() as full:
+            full.setattr(sys, "stderr", disk)
+            with pytest.raises(typer.Exit) as ended:
+                agent_program._serve(host, ThreadWorker())
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    assert done == ["cycle", "cycle", "cycle", "close"]
     assert ended.value.exit_code == EXIT_LOST
