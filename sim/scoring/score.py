@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coordinator.identification.identified import Identified
-from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart, migrate
+from coordinator.identification.result import (
+    SCHEMA,
+    ChainPart,
+    LinkPart,
+    Result,
+    TorqueTermPart,
+    UnresolvedPart,
+    migrate,
+)
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.errors import DataError, UsageError
 from module_agent.model.model_faults import first_fault
@@ -72,7 +80,9 @@ class Score(BaseModel):
     first module, if estimate and truth begin at the same one. Torque errors
     are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
     joint whose true torque is below `MIN_TORQUE_NM` (rms); its error in Nm is given nevertheless, as are the
-    torques that the errors are relative to.
+    torques that the errors are relative to. A joint's error e is also split into that of a scale, s tau with
+    s = <e, tau> / <tau, tau>, and the rest, the error of the shape. A scale of the torque sensor, which the
+    result claims to know within its sigma (zero where it has none), explains the former alone.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -89,12 +99,24 @@ class Score(BaseModel):
     torque_relative_error: float | None = None
     torque_relative_error_per_joint: dict[str, float | None] | None = None
     torque_rms_error_nm_per_joint: dict[str, float] | None = None
+    torque_scale_error_per_joint: dict[str, float | None] | None = None
+    torque_scale_sigma_per_joint: dict[str, float] | None = None
+    torque_shape_error_nm_per_joint: dict[str, float] | None = None
     torque_relative_error_measured: float | None = None
     torque_rms_nm: float | None = None
     torque_rms_nm_per_joint: dict[str, float] | None = None
     measured_torque_rms_nm: float | None = None
     robot_time_s: float
     wall_time_s: float | None
+
+
+class _DynamicsFile(BaseModel):
+    """The part of the dynamics in `result.json` that scoring needs."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    held_out: dict[str, Any] | None = None
+    torque_terms: list[TorqueTermPart] = []
 
 
 class _ResultFile(BaseModel):
@@ -109,7 +131,7 @@ class _ResultFile(BaseModel):
     null_basis: list[list[float]]
     chain_covariance: list[list[float]] = []
     links: list[LinkPart]
-    dynamics: dict[str, Any] | None
+    dynamics: _DynamicsFile | None
     robot_time_s: float
     wall_time_s: float | None
 
@@ -137,7 +159,7 @@ def score(run: Path) -> Score:
         truth = read_truth(path).chain
     basis = _null_basis(result, run / "result.json")
     torque: dict[str, Any] = {}
-    if result.dynamics is not None and result.dynamics.get("held_out") is not None:
+    if result.dynamics is not None and result.dynamics.held_out is not None:
         held_out = _read_held_out(run / "held_out.npz", len(result.serials))
         with _reading(run / "truth.npz") as path:
             motion = read_motion(path)
@@ -177,6 +199,7 @@ def _compared(
         unidentifiable=[item.summary for item in result.unresolved],
         robot_time_s=result.robot_time_s,
         wall_time_s=result.wall_time_s,
+        torque_scale_sigma_per_joint=_scale_sigma(result) if torque else None,
         **torque,
     )
 
@@ -220,15 +243,27 @@ def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source
     predicted = held_out.tau_predicted_nm[:, known]
     size, error = _rms(true), _rms(predicted - true)
     relative = [e / s if s >= MIN_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
+    along = ((predicted - true) * true).mean(axis=0) / np.maximum(size, MIN_TORQUE_NM) ** 2
+    scale = [float(a) if s >= MIN_TORQUE_NM else None for a, s in zip(along, size, strict=True)]
+    shape = _rms(predicted - true * np.array([1.0 + (a or 0.0) for a in scale]))
     return {
         "torque_relative_error": _ratio(predicted, true),
         "torque_relative_error_per_joint": dict(zip(own, relative, strict=True)),
         "torque_rms_error_nm_per_joint": dict(zip(own, error, strict=True)),
+        "torque_scale_error_per_joint": dict(zip(own, scale, strict=True)),
+        "torque_shape_error_nm_per_joint": dict(zip(own, shape, strict=True)),
         "torque_relative_error_measured": measured,
         "torque_rms_nm": float(np.sqrt(np.mean(true**2))),
         "torque_rms_nm_per_joint": dict(zip(own, size, strict=True)),
         "measured_torque_rms_nm": size_measured,
     }
+
+
+def _scale_sigma(result: "_ResultFile | Result") -> dict[str, float]:
+    """Return the standard deviation that the result claims of the scale of each module's torque sensor."""
+    terms = [] if result.dynamics is None else result.dynamics.torque_terms
+    claimed = {term.serial: term.sigma for term in terms if term.term == "scale"}
+    return {serial: claimed.get(serial, 0.0) for serial in result.serials}
 
 
 def true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], source: str) -> Array:

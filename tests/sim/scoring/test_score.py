@@ -206,6 +206,40 @@ def test_torque_errors_are_relative_to_the_true_and_to_the_measured_torque(tmp_p
     assert found.torque_relative_error_measured == pytest.approx(0.25)
 
 
+def test_an_error_of_scale_is_told_from_an_error_of_shape(tmp_path: Path) -> None:
+    term = {
+        "serial": "left-1",
+        "term": "scale",
+        "unit": "",
+        "significant": True,
+        "value": 0.02,
+        "sigma": 0.03,
+    }
+    dynamics = {"held_out": {"relative_error": 0.1}, "torque_terms": [term]}
+    found = score(make_run(tmp_path, TRUTH, predicted=0.9, dynamics=dynamics))
+    assert found.torque_scale_error_per_joint == pytest.approx(dict.fromkeys(SERIALS, -0.1), abs=1e-6)
+    assert found.torque_shape_error_nm_per_joint == pytest.approx(dict.fromkeys(SERIALS, 0.0), abs=1e-6)
+    assert found.torque_scale_sigma_per_joint == dict.fromkeys(SERIALS, 0.0) | {"left-1": 0.03}
+    # Errors of both kinds add up in squares.
+    with np.load(tmp_path / "held_out.npz") as file:
+        columns = dict(file)
+    columns["tau_predicted_nm"] = columns["tau_predicted_nm"] + np.sin(np.arange(900.0))[:, None]
+    np.savez(tmp_path / "held_out.npz", **columns)
+    found = score(tmp_path)
+    for serial in SERIALS:
+        error, size, scale, shape = (
+            values[serial] or 0.0
+            for values in (
+                found.torque_rms_error_nm_per_joint or {},
+                found.torque_rms_nm_per_joint or {},
+                found.torque_scale_error_per_joint or {},
+                found.torque_shape_error_nm_per_joint or {},
+            )
+        )
+        assert shape > 0.5
+        assert error**2 == pytest.approx((scale * size) ** 2 + shape**2, rel=1e-9)
+
+
 def test_a_torque_too_small_to_measure_by_is_scored_in_newton_metres(tmp_path: Path) -> None:
     run = make_run(tmp_path, TRUTH)
     # The module at the end of the first arm turns a bare output; all are predicted to do what the others do.
