@@ -21,7 +21,7 @@ from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.hardware import HardwareLost, Modules
 from module_agent.hardware.hebi_library import HEBI
 from module_agent.hardware.hebi_library import library as hebi_library
-from module_agent.hardware.hebi_network import HebiOptions, open_modules, seen
+from module_agent.hardware.hebi_network import FAMILY, RATE_HZ, HebiOptions, open_modules, seen
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import EXIT_FAILED, EXIT_LOST, EXIT_USAGE, RobotError, UsageError
@@ -141,7 +141,7 @@ def main(
     ] = None,
     bus: Annotated[str, typer.Option(help="Path of the physics bus of the world.")] = "",
     hebi: Annotated[bool, typer.Option("--hebi", help="Run real HEBI modules, in place of a bus.")] = False,
-    family: Annotated[str, typer.Option(help="HEBI: family of the modules.")] = "HEBI",
+    family: Annotated[str, typer.Option(help="HEBI: family of the modules.")] = FAMILY,
     name: Annotated[
         list[str] | None, typer.Option(help="HEBI: name of a module; repeat for several [all of the family].")
     ] = None,
@@ -149,7 +149,9 @@ def main(
         list[str] | None,
         typer.Option("--type", help="HEBI: type of each module, in their order [what they tell]."),
     ] = None,
-    rate: Annotated[float, typer.Option(help="HEBI: ticks a second, each a command and a feedback.")] = 250.0,
+    rate: Annotated[
+        float, typer.Option(help="HEBI: ticks a second, each a command and a feedback.")
+    ] = RATE_HZ,
     list_modules: Annotated[
         bool, typer.Option("--list", help="HEBI: list the modules on the network, and end.")
     ] = False,
@@ -195,7 +197,10 @@ def main(
     Simulated modules are those of a world on a physics bus (--serial, --bus), real ones those on HEBI's
     network (--hebi --family F --name N).
     """
-    if hebi and list_modules:
+    of_hebi = {"--family": family != FAMILY, "--name": name, "--type": module_type, "--rate": rate != RATE_HZ}
+    with _usage_errors():
+        _check_source(hebi, of_hebi | {"--list": list_modules}, {"--serial": serial, "--bus": bus})
+    if list_modules:
         _list(library)
         return
     options = HebiOptions(family, tuple(name or ()), tuple(module_type or ()), rate, safety, library)
@@ -217,10 +222,28 @@ def main(
             check_chunk("serial", one)
         network_named(network)
         _check_expiry(expiry, hebi)
-        if not hebi and not (serial and bus):
-            raise UsageError("give --serial and --bus for simulated modules, or --hebi for real ones")
         limits = read_safety(safety, serial or []) if safety and not hebi else {}
     _run(robot, options if hebi else _OnBus(bus, tuple(serial or ()), limits), open_transport, settings)
+
+
+def _check_source(hebi: bool, of_hebi: Mapping[str, object], of_bus: Mapping[str, object]) -> None:
+    """Check that modules are given either on a bus or on HEBI's network.
+
+    An option of the other kind is no way to choose among these: without this check all of them would be run.
+
+    Raises:
+        UsageError: neither is given, or options of both.
+    """
+    if not hebi and not any(of_hebi.values()) and not all(of_bus.values()):
+        raise UsageError("give --serial and --bus for simulated modules, or --hebi for real ones")
+    other = [option for option, given in (of_bus if hebi else of_hebi).items() if given]
+    if other:
+        why = (
+            "simulated modules; real ones are chosen by --family and --name"
+            if hebi
+            else "real modules: add --hebi"
+        )
+        raise UsageError(f"{', '.join(other)} chooses {why}")
 
 
 class _OnBus(NamedTuple):

@@ -184,7 +184,7 @@ def _factors(
 ) -> TorqueFactors:
     """Return the factors of the joints' readings by a recording with a known payload."""
     robot, log, plain = recordings.robot, recordings.log, choice._replace(coupled=(), tried=())
-    cutoff = cutoff_hz or chosen_cutoff_hz(cutoff_curve(robot, log, plain))
+    cutoff = chosen_cutoff_hz(cutoff_curve(robot, log, plain)) if cutoff_hz is None else cutoff_hz
     unloaded = _posed(robot, log, plain, cutoff, instruments=False)
     return factors_by_payload(unloaded, _posed_like(unloaded, recordings, loaded), payload)
 
@@ -220,7 +220,7 @@ def _chosen(
     with_pairs = choice._replace(coupled=choice.coupled or pairs(choice, joints))
     curve = cutoff_curve(robot, log, with_pairs) if cutoff_hz is None else ()
     extra = candidates(choice, joints)
-    cutoff = cutoff_hz or chosen_cutoff_hz(curve)
+    cutoff = chosen_cutoff_hz(curve) if cutoff_hz is None else cutoff_hz
     posed = _posed(robot, log, choice._replace(extra=extra), cutoff, instruments)
     if checked and (texts := list(wrong_torques(posed.with_drives(lambda d: d not in extra), log))):
         raise DataFileError("\n".join(texts))

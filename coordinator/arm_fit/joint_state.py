@@ -1,14 +1,15 @@
 """Recordings of ROS: `sensor_msgs/JointState` in MCAP files, as CDR of ROS 2 or as JSON."""
 
 import json
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Message
 
 from module_agent.model.errors import UsageError
 
@@ -43,11 +44,31 @@ def joint_states(path: Path) -> Iterator[JointState]:
                         f"topic {channel.topic} is encoded as {channel.message_encoding!r}; "
                         f"{' and '.join(_DECODERS)} are read"
                     )
-                stamp, names, *signals = _DECODERS[channel.message_encoding](message.data)
-                values = [dict(zip(names, signal, strict=False)) for signal in signals]
+                stamp, *values = _decoded(channel.topic, channel.message_encoding, message)
                 yield JointState(stamp or message.log_time * _NS, *values)
         except McapError as error:
             raise UsageError(f"not an MCAP file: {error}") from error
+
+
+def _decoded(
+    topic: str, encoding: str, message: Message
+) -> tuple[float, dict[str, float], dict[str, float], dict[str, float]]:
+    """Return time [s], position, velocity and effort by joint of one message.
+
+    Raises:
+        UsageError: it is damaged, or no JointState.
+    """
+    try:
+        stamp, names, *signals = _DECODERS[encoding](message.data)
+        position, velocity, effort = (
+            {name: float(value) for name, value in zip(names, signal, strict=False)} for signal in signals
+        )
+        return float(stamp), position, velocity, effort
+    except (ValueError, TypeError, AttributeError, LookupError, struct.error) as error:
+        at_s = _NS * message.log_time
+        raise UsageError(
+            f"topic {topic}: the message of {at_s:.3f} s is damaged, or no JointState as {encoding}: {error}"
+        ) from error
 
 
 def _json(data: bytes) -> _Message:
@@ -63,7 +84,7 @@ def _json(data: bytes) -> _Message:
 def _cdr(data: bytes) -> _Message:
     """Decode Common Data Representation: four bytes of header, numbers aligned to their size behind it."""
     order, body, at = "<" if data[1] & 1 else ">", data[4:], 0
-    integer = Struct(order + "I")
+    integer = struct.Struct(order + "I")
 
     def number() -> int:
         nonlocal at

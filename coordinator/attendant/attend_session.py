@@ -154,7 +154,7 @@ class AttendSession:
 
     def _take(self, step: Step) -> Measurement | None:
         self.changed |= bool(step.say or step.warn)
-        for line in step.say:
+        for line in (*step.remarks, *step.say):
             self._say(line)
         for line in step.warn:
             self._listener.warn(line, self._site.clock())

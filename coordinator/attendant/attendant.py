@@ -66,11 +66,15 @@ class Measurement(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What to say, and what to measure, if anything; `warn` is said last, also where all else is quiet."""
+    """What to say, and what to measure, if anything; `warn` is said last, also where all else is quiet.
+
+    remarks: what is to be said too, though nothing has changed.
+    """
 
     say: tuple[str, ...] = ()
     measure: Measurement | None = None
     warn: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 class Outcome(NamedTuple):
@@ -112,6 +116,8 @@ class Attendant:
         self._since: dict[str, tuple[bool, int]] = {}
         self._present_ns: int | None = None
         self._boots: dict[str, int] = {}
+        self._begin_ns: int | None = None
+        self._was_seen = self._is_awaited = False
         self._off = False
         self._structure: tuple[str, ...] = ()
         self._lasting: dict[Key, _Cause] = {}
@@ -127,6 +133,8 @@ class Attendant:
 
     def look(self, seen: Observation) -> Step:
         """Take in what is there now; return what to say, and what to measure."""
+        if not self._was_seen and (step := self._first(seen)) is not None:
+            return step
         if self._present_ns is None or seen.present:
             self._present_ns = seen.t_ns
         since_ns = seen.t_ns if self._present_ns is None else self._present_ns
@@ -182,6 +190,17 @@ class Attendant:
         return Step(outcome.words)
 
     # ------------------------------------------------------------------ what has changed
+
+    def _first(self, seen: Observation) -> Step | None:
+        """Wait for the first module; None once there is one: a robot that was not there yet has not gone."""
+        if seen.present:
+            self._was_seen = True
+            return None
+        self._begin_ns = seen.t_ns if self._begin_ns is None else self._begin_ns
+        if self._is_awaited or not self._lasts(seen.t_ns, self._begin_ns, self._patience.gone_s):
+            return Step()
+        self._is_awaited = True
+        return Step(remarks=("waits for the robot: no module is on the network yet",))
 
     def _presence(self, seen: Observation, off: bool) -> list[str]:
         """Note who came and went; say it where it lasts."""

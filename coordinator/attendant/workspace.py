@@ -84,6 +84,19 @@ class Workspace(_Table):
         """Return the range of a joint."""
         return self.joints.get(serial, self.joints["all"])
 
+    def check_joints(self, serials: Collection[str]) -> None:
+        """Check that every range is one of a module of the robot: another joint's would not hold.
+
+        Raises:
+            UsageError: one is of no module.
+        """
+        unknown = [name for name in self.joints if name != "all" and name not in serials]
+        if unknown:
+            raise UsageError(
+                f"the workspace has ranges of {', '.join(unknown)}, which the robot does not have: its "
+                f"joints are named by the serials of their modules, {', '.join(sorted(serials))}"
+            )
+
     def plan(self, plan: Plan, serials: Sequence[str]) -> Plan:
         """Return a plan whose motions about home have the room that the joints have; it begins slowly.
 

@@ -14,7 +14,7 @@ from coordinator.parameter_fit.payload import Payload, find_payload
 from coordinator.parameter_fit.report_parts import Part, Triple, triple
 from coordinator.parameter_fit.torque_sensor_scale import SCALE_SIGMA
 from coordinator.recording.journal import Purpose
-from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, dynamic_motion
+from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, dynamic_motion
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
 from module_agent.model.files import write_json
@@ -105,8 +105,8 @@ def search_payload(baseline: BaselineRobot, later: BaselineRobot) -> PayloadRepo
             found, taken_off = (lost, True) if lost.found else (found, False)
     except DataError as error:
         raise PayloadError(f"{later.folder} cannot be compared with {baseline.folder}: {error}") from error
-    # All joints move simultaneously: one segment without a gap.
-    spent_s = 1e-9 * float(moved.t_ns[-1] - moved.t_ns[0])
+    # Of a finished run there may be several motions, with pauses that do not count.
+    spent_s = len(moved.t_ns) / RATE_HZ
     return _report(found, chain, later.name, str(baseline.folder), spent_s, taken_off)
 
 

@@ -72,6 +72,7 @@ def attend(
     settings, known = planned(plan), read_result(baseline)
     if room is not None:
         # Refused now, and not when something has changed.
+        room.check_joints(known.serials)
         room.plan(settings, known.serials)
         versions.check_writable()
     loop = ScaledLoop(speed)

@@ -20,6 +20,7 @@ from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, rea
 from coordinator.dynamics.drive_model import USUAL_TERMS
 from coordinator.report.pages import html_page
 from coordinator.report.plots import check_plots
+from coordinator.runtime.command_line import in_a_folder
 from coordinator.runtime.terminal import Terminal, print_table, write_result
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
@@ -52,18 +53,27 @@ _Gain = Annotated[
     ),
 ]
 _Html = Annotated[
-    Path | None, typer.Option("--html", help="HTML file with the tables and a plot of each joint's torque.")
+    Path | None,
+    typer.Option(
+        "--html", help="HTML file with the tables and a plot of each joint's torque.", callback=in_a_folder
+    ),
 ]
 _Predictions = Annotated[
     Path | None,
-    typer.Option(help="CSV file of torques: measured, filtered, fitted, and predicted by the other half."),
+    typer.Option(
+        help="CSV file of torques: measured, filtered, fitted, and predicted by the other half.",
+        callback=in_a_folder,
+    ),
 ]
 _Matrices = Annotated[
-    Path | None, typer.Option(help="npz file of base parameters with covariance and grouping matrix.")
+    Path | None,
+    typer.Option(
+        help="npz file of base parameters with covariance and grouping matrix.", callback=in_a_folder
+    ),
 ]
 _FittedUrdf = Annotated[
     Path | None,
-    typer.Option(help="File to write the URDF with the fitted bodies and friction to."),
+    typer.Option(help="File to write the URDF with the fitted bodies and friction to.", callback=in_a_folder),
 ]
 _Trust = Annotated[float, typer.Option(help="Weight of the URDF's inertias as the prior of the bodies.")]
 _Terms = Annotated[str, typer.Option(help=f"Terms of the drives, of {', '.join(DRIVE_TERMS)}; or none.")]
@@ -157,49 +167,45 @@ def fit_dynamics(
     """
     if html_file is not None:
         check_plots()
-    _check_folders(json_file, html_file, predictions, matrices, fitted_urdf)
     numbers = count(1)
-    try:
-        with Terminal(quiet) as terminal:
-            robot = read_urdf(urdf, _gravity(gravity))
-            fit = arm_fit.fit_dynamics(
-                robot,
-                data,
-                held_out=held_out,
-                gains=_gains(gain or ()),
-                choice=ModelChoice(_terms(terms), _pairs(robot, coupled), robust, slow, mask, _terms(tried)),
-                instruments=instruments,
-                cutoff_hz=cutoff,
-                trust=trust,
-                checked=not unchecked,
-                baseline=baseline,
-                payload_body=payload_body if known_payload is None else None,
-                loaded=loaded,
-                known_payload=_known_payload(known_payload, payload_body),
-                progress=lambda text: terminal.step(next(numbers), STEPS, text),
-            )
-        for line in notes(fit.report):
-            terminal.note(line)
-        if write_result(json_file, fit.report):
-            for table in tables(fit.report):
-                print_table(table)
-        if html_file is not None:
-            write_text(html_file, html_page(page(fit.report, fit.torques)))
-        if predictions is not None:
-            write_predictions(predictions, fit.torques)
-        if matrices is not None:
-            write_matrices(matrices, fit.base)
-        if fitted_urdf is not None:
-            fit.write_urdf(fitted_urdf)
-    except OSError as error:
-        raise UsageError(f"{error.filename}: {error.strerror}") from error
-
-
-def _check_folders(*outputs: Path | None) -> None:
-    """Check before the work that its results can be written."""
-    for path in outputs:
-        if path is not None and not path.parent.is_dir():
-            raise UsageError(f"{path}: there is no folder {path.parent}")
+    with Terminal(quiet) as terminal:
+        robot = read_urdf(urdf, _gravity(gravity))
+        fit = arm_fit.fit_dynamics(
+            robot,
+            data,
+            held_out=held_out,
+            gains=_gains(gain or ()),
+            choice=ModelChoice(
+                _terms("--terms", terms),
+                _pairs(robot, coupled),
+                robust,
+                slow,
+                mask,
+                _terms("--tried", tried),
+            ),
+            instruments=instruments,
+            cutoff_hz=cutoff,
+            trust=trust,
+            checked=not unchecked,
+            baseline=baseline,
+            payload_body=payload_body if known_payload is None else None,
+            loaded=loaded,
+            known_payload=_known_payload(known_payload, payload_body),
+            progress=lambda text: terminal.step(next(numbers), STEPS, text),
+        )
+    for line in notes(fit.report):
+        terminal.note(line)
+    if write_result(json_file, fit.report):
+        for table in tables(fit.report):
+            print_table(table)
+    if html_file is not None:
+        write_text(html_file, html_page(page(fit.report, fit.torques)))
+    if predictions is not None:
+        write_predictions(predictions, fit.torques)
+    if matrices is not None:
+        write_matrices(matrices, fit.base)
+    if fitted_urdf is not None:
+        fit.write_urdf(fitted_urdf)
 
 
 def _gravity(text: str) -> list[float]:
@@ -237,13 +243,13 @@ def _gains(texts: Sequence[str]) -> dict[str, float]:
     return gains
 
 
-def _terms(text: str) -> tuple[Term, ...]:
+def _terms(option: str, text: str) -> tuple[Term, ...]:
     words = [word.strip() for word in text.split(",")]
     known = tuple(term for term in DRIVE_TERMS if term in words)
     if words == ["none"]:
         return ()
     if len(known) != len(words):
-        raise UsageError(f"terms {text!r}: known are {', '.join(DRIVE_TERMS)}, each once, or none")
+        raise UsageError(f"{option} {text!r}: known are {', '.join(DRIVE_TERMS)}, each once, or none")
     return known
 
 

@@ -106,6 +106,9 @@ def measured_again(
         UsageError: neither is chosen, or both; otherwise as `run_attended`.
     """
     if again.out is None and again.measured is not None:
+        given = {"--expect": again.expect, "--plan": again.plan, "--speed": again.speed != 1.0}
+        if moot := [option for option, value in given.items() if value]:
+            raise UsageError(f"{', '.join(moot)} is of a new run: --measured compares with a finished one")
         return load_baseline(again.measured)
     if again.out is None or again.measured is not None:
         raise UsageError("give either --out, to measure the robot, or --measured, a run to compare with")

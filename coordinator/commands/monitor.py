@@ -27,7 +27,7 @@ from coordinator.runtime.command_line import end_if_suspect, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.key_presses import key_presses
 from coordinator.runtime.terminal import Terminal
-from coordinator.synchronisation.round_trips import map_clocks
+from coordinator.synchronisation.round_trips import BootClocks
 from module_agent.model.errors import EXIT_FINDING, DataError, RobotError, UsageError
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
@@ -65,8 +65,16 @@ def monitor_robot(
     Exit codes: 0 no findings, 4 findings, 5 no findings but a suspect baseline, others as of `run`.
     """
     if baseline is None:
+        if alarms_per_hour != ALARMS_PER_HOUR:
+            raise UsageError(
+                "--alarms-per-hour is of findings, which need a baseline: give the folder of a run"
+            )
         _show_modules(at, recording, for_s, json_file, speed)
         return
+    if recording is not None and (for_s is not None or speed != 1.0):
+        raise UsageError(
+            "--for and --speed are of a robot that is monitored live: a --recording is read whole"
+        )
     if recording is not None and not recording.is_file():
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     known = load_baseline(baseline)
@@ -154,8 +162,13 @@ def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
     missing = [s for s in serials if s not in whole.modules or not whole.modules[s].round_trips]
     if missing:
         raise DataError(f"{path} has no feedback or no round trips of {', '.join(missing)}")
-    clocks = map_clocks({s: whole.modules[s].round_trips for s in serials})
-    looked_ns, recording = 0, Recording()
+    looked_ns, recording, clocks = 0, Recording(), BootClocks(whole, serials)
+
+    def look() -> None:
+        mapped = clocks.of(recording)
+        if mapped is not None:
+            screen.report(monitor.advance(recording, mapped))
+
     for entry in read_session(path):
         if not screen.start_ns:
             screen.start_ns = entry.t_ns
@@ -165,10 +178,12 @@ def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
             continue  # counted by the recording, by reason
         if entry.t_ns - looked_ns > UPDATE_S * 1e9:
             looked_ns = entry.t_ns
-            screen.report(monitor.advance(recording, clocks))
+            look()
             for module in recording.modules.values():
                 module.rows.forget_before(module.rows.end_row - retained_rows(module))
-    screen.report(monitor.advance(recording, clocks))
+    look()
+    if not monitor.monitored_s:
+        raise DataError(f"{path}: nothing was compared: at no time all of {', '.join(serials)} sent feedback")
 
 
 def _monitor_live(

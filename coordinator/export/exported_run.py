@@ -99,6 +99,7 @@ def exported(recording: Recording, urdf: str | None, missing: list[str]) -> Expo
         else:
             known[serial] = module
             missing += _lost_samples(module)
+    missing += _earlier_boots(recording)
     if not known:
         raise DataError("; ".join(["no module has samples with a known clock", *missing]))
     clocks = map_clocks({serial: module.trips for serial, module in known.items()})
@@ -112,6 +113,15 @@ def _lost_samples(module: ModuleRecord) -> list[str]:
     first, end = module.rows.first_row, module.rows.end_row
     lost = sum(stop - start for start, stop in module.rows.missing(first, end))
     return [f"{module.serial}: {lost} of {end - first} samples were lost"] if lost else []
+
+
+def _earlier_boots(recording: Recording) -> list[str]:
+    """Name the samples of modules before they booted anew: of each the latest boot is exported."""
+    return [
+        f"{serial}: {module.rows.count} samples of an earlier boot are left out, before it booted anew"
+        for (serial, boot), module in sorted(recording.past.items())
+        if module.rows.count and recording.modules[serial].boot != boot
+    ]
 
 
 def _start_ns(

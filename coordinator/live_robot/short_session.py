@@ -79,21 +79,23 @@ class ShortSession:
         start_ns = self._clock()
 
         def complete(present: frozenset[str], quiet_s: float) -> bool:
-            if serials:
-                return set(serials) <= present
-            if search.expect:
-                return len(present) >= search.expect
+            if serials or search.expect:
+                return set(serials) <= present and len(present) >= (search.expect or 0)
             is_over = self._clock() - start_ns >= 1e9 * search.min_s
             return is_over and bool(present) and quiet_s >= search.quiet_s
 
         present = await await_modules(self._messenger, self._clock, complete, MAX_S)
         if not present or not set(serials) <= present or len(present) < (search.expect or 0):
             there = ", ".join(sorted(present)) or "none"
+            missing = ", ".join(sorted(set(serials) - present))
+            what = (
+                f"{missing} of robot {self._name!r} is missing"
+                if missing
+                else (f"modules of robot {self._name!r} are missing")
+            )
             wanted = f", {search.expect} are expected" if search.expect else ""
             question = "" if present else IS_IT_THERE
-            raise RobotError(
-                f"modules of robot {self._name!r} are missing{wanted}; there are {there}{question}"
-            )
+            raise RobotError(f"{what}{wanted}; there are {there}{question}")
         await group.meet(serials or sorted(present))
         if not await group.wait(lambda: not group.without_feedback(), FEEDBACK_WAIT_S):
             silent = ", ".join(sorted(group.without_feedback()))

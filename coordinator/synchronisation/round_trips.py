@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.recording.recording import RoundTrip
+from coordinator.recording.recording import Recording, RoundTrip
 from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap, Times
 
@@ -66,6 +66,29 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     return {reference: base} | {
         name: _relative_map(base, columns[reference], columns[name]) for name in others
     }
+
+
+class BootClocks:
+    """The clock maps of a finished recording: at every place of it those of the modules' boots there.
+
+    A module that boots anew has another clock: its rows before and after do not follow one map.
+    """
+
+    def __init__(self, whole: Recording, serials: Sequence[str]):
+        self._whole, self._serials = whole, tuple(serials)
+        self._known: dict[tuple[int, ...], dict[str, ClockMap] | None] = {}
+
+    def of(self, so_far: Recording) -> dict[str, ClockMap] | None:
+        """Return the maps by serial; None where a module is unheard of yet, or its boot has no round trip."""
+        if any(serial not in so_far.modules for serial in self._serials):
+            return None
+        boots = tuple(so_far.modules[serial].boot for serial in self._serials)
+        if boots not in self._known:
+            records = [self._whole.past.get(key) for key in zip(self._serials, boots, strict=True)]
+            trips = {record.serial: record.round_trips for record in records if record is not None}
+            whole = len(trips) == len(self._serials) and all(trips.values())
+            self._known[boots] = map_clocks(trips) if whole else None
+        return self._known[boots]
 
 
 def simultaneous(reference_ns: Times, sent_ns: Times) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

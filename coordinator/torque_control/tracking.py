@@ -102,17 +102,17 @@ def _check_joint(
     speed = min(limits.max_speed_rad_s, kind.max_speed_rad_s)
     effort = min(limits.max_effort_nm, kind.max_effort_nm)
     checks = (
-        ("position", -q, None if low is None else -low, "rad"),
-        ("position", q, high, "rad"),
-        ("speed", np.abs(reference.qd_rad_s[:, column]), speed, "rad/s"),
-        ("calculated torque", np.abs(torque_nm), effort, "Nm"),
+        ("position", q, low, -1.0, "rad"),
+        ("position", q, high, 1.0, "rad"),
+        ("speed", np.abs(reference.qd_rad_s[:, column]), speed, 1.0, "rad/s"),
+        ("calculated torque", np.abs(torque_nm), effort, 1.0, "Nm"),
     )
-    for what, values, most, unit in checks:
-        worst = int(np.argmax(values))
-        if most is not None and values[worst] > most:
+    for what, values, limit, side, unit in checks:
+        worst = int(np.argmax(side * values))
+        if limit is not None and side * values[worst] > side * limit:
             raise MotionRefused(
-                f"joint {serial} ({kind.name}): {what} {abs(values[worst]):.2f} {unit} at "
-                f"{reference.t_s[worst]:.2f} s of the motion, its limit is {abs(most):.2f} {unit}"
+                f"joint {serial} ({kind.name}): {what} {values[worst]:.2f} {unit} at "
+                f"{reference.t_s[worst]:.2f} s of the motion, its limit is {limit:.2f} {unit}"
             )
 
 

@@ -31,6 +31,10 @@ AT_LIMIT: dict[LimitAction, int] = {"hold": 0, "spring": 1, "motor_off": 2, "dis
 AT_M_STOP: dict[MStopAction, int] = {"disabled": 0, "motor_off": 1, "hold": 2}
 
 
+# HEBI's own family, and as many ticks a second as `run` records by default.
+FAMILY, RATE_HZ = "HEBI", 250.0
+
+
 class HebiOptions(NamedTuple):
     """Which modules to drive and how: those of a family by their names, or all of them without.
 
@@ -41,7 +45,7 @@ class HebiOptions(NamedTuple):
     family: str
     names: tuple[str, ...] = ()
     types: tuple[str, ...] = ()
-    rate_hz: float = 250.0
+    rate_hz: float = RATE_HZ
     safety: Path | None = None
     library: str = HEBI
 

@@ -227,13 +227,13 @@ class _Reader:
         return found
 
     def _number(self, element: Element, name: str) -> float:
-        return float(self._formula(element, name, element.get(name, "0")))
+        return self._scalar(element, name, element.get(name, "0"))
 
     def _vector(self, element: Element, name: str) -> Array:
         words = element.get(name, "0 0 0").split()
         if len(words) != 3:
             raise self._fail(f"<{element.tag}>: {name} has {len(words)} numbers, not 3")
-        return np.array([float(self._formula(element, name, word)) for word in words])
+        return np.array([self._scalar(element, name, word) for word in words])
 
     def _rotation(self, element: Element, name: str) -> Array:
         text = element.get(name, "1 0 0 0 1 0 0 0 1")
@@ -241,10 +241,17 @@ class _Reader:
             found = np.asarray(self._formula(element, name, text))
         else:
             words = text.split()
-            found = np.array([float(self._formula(element, name, word)) for word in words])
-        if found.size != 9 or np.abs(found.reshape(3, 3) @ found.reshape(3, 3).T - np.eye(3)).max() > 1e-4:
+            found = np.array([self._scalar(element, name, word) for word in words])
+        matrix = found.reshape(3, 3) if found.size == 9 else np.zeros((3, 3))
+        if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4 or np.linalg.det(matrix) < 0.0:
             raise self._fail(f"<{element.tag}>: {name} {text!r} is no rotation")
-        return found.reshape(3, 3)
+        return matrix
+
+    def _scalar(self, element: Element, name: str, text: str) -> float:
+        value = self._formula(element, name, text)
+        if np.ndim(value):
+            raise self._fail(f"<{element.tag}>: {name} {text!r} is a rotation, not a number")
+        return float(value)
 
     def _formula(self, element: Element, name: str, text: str) -> Any:
         try:

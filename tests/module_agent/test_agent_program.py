@@ -63,6 +63,17 @@ STAND_IN = ("--hebi", "--library", "sim.hebi_stand_in.on_bus")
         ((*STAND_IN, "--expiry", "damping"), "it must be motor_off or hold with --hebi"),
         (STAND_IN, "the environment has no X5_STAND_IN_BUS and no X5_STAND_IN_SERIALS"),
         ((*STAND_IN, "--list"), "the environment has no X5_STAND_IN_BUS"),
+        (
+            (*STAND_IN, "--serial", "A"),
+            "--serial chooses simulated modules; real ones are chosen by --family",
+        ),
+        ((*STAND_IN, "--bus", "runs/bus"), "--bus chooses simulated modules"),
+        (("--list",), "--list chooses real modules: add --hebi"),
+        (
+            ("--serial", "A", "--bus", "b", "--family", "Arm", "--rate", "500"),
+            "--family, --rate chooses real",
+        ),
+        (("--serial", "A", "--bus", "b", "--name", "elbow"), "--name chooses real modules: add --hebi"),
         (("--hebi", "--library", "no_such_library"), "pip install --no-deps hebi-py==2"),
     ],
 )

@@ -119,6 +119,11 @@ def test_the_command_says_so_and_exits_with_4(days: Days, monkeypatch: pytest.Mo
     arguments = ["check", str(days.known.folder), "--measured"]
     sound = CliRunner().invoke(app, [*arguments, str(days.sound.folder)])
     assert sound.exit_code == 0, sound.output
+    moot = CliRunner().invoke(app, [*arguments, str(days.sound.folder), "--expect", "4"])
+    assert moot.exit_code == 2
+    assert "--expect is of a new run: --measured compares with a finished one" in " ".join(
+        moot.output.split()
+    )
     slipped = CliRunner().invoke(app, [*arguments, str(days.changed.folder), "--json", "-"])
     assert slipped.exit_code == EXIT_FINDING
     written = json.loads((days.changed.folder / CHECK).read_text())

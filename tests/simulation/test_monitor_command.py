@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.main import app
+from coordinator.recording.session_file import SessionWriter, read_session
 from tests.simulation.known_arm import ARM, GRASPED_S, lived
 
 # Tests of this group share recorded runs: they stay in one process.
@@ -69,4 +70,17 @@ def test_wrong_usage_is_answered_with_what_would_be_right(known: Path, tmp_path:
     code, findings = watch(str(known), "--recording", str(tmp_path / "none.mcap"))
     assert code == 2
     assert "none.mcap" in findings
+    # Two seconds from the beginning, in which only a little of the feedback is there.
+    entries = list(read_session(known / "session.mcap"))
+    writer = SessionWriter(tmp_path / "short.mcap")
+    seen: set[str] = set()
+    for entry in entries:
+        writer.write(entry)
+        seen |= {s for s in ARM.serials if f"/{s}/" in entry.topic and entry.kind == "reply"}
+        if len(seen) == len(ARM.serials):
+            break
+    writer.close()
+    code, said = watch(str(known), "--recording", str(tmp_path / "short.mcap"))
+    assert code == 1
+    assert "short.mcap" in said
     assert watch(str(known), "--json", str(tmp_path / "no" / "file"), "--recording", "x")[0] == 2

@@ -50,8 +50,12 @@ def test_gains_go_to_the_modules_in_the_order_of_the_file_and_stay(
 
 def test_a_module_that_is_not_there_is_named_with_those_that_are(rigs: Callable[..., Any]) -> None:
     rig = rigs(ROBOT, "lan")
-    with pytest.raises(RobotError, match="there are X-00009, X-00010"):
-        rig.run(session(rig, ("X-1",)).load_gains(softer))
+    with pytest.raises(RobotError, match=r"^X-1 of robot .* is missing; there are X-00009, X-00010"):
+        rig.run(session(rig, ("X-1", "X-00010")).load_gains(softer))
+    with pytest.raises(
+        RobotError, match=r"^modules of robot .* are missing, 3 are expected; there are X-00009"
+    ):
+        rig.run(session(rig, ("X-00010",), Search(expect=3)).load_gains(softer))
 
 
 @pytest.mark.parametrize("named", [(), ("X-00010",)], ids=["all", "named"])

@@ -84,6 +84,32 @@ def test_joint_states_are_a_recording(tmp_path: Path, encoding: str, velocity: b
 
 
 @pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("json", b"{no json"),
+        ("json", b"[1, 2]"),
+        ("json", b'{"name": ["elbow"], "position": ["far"]}'),
+        ("json", b'{"name": "elbow", "position": 3}'),
+        ("cdr", b""),
+        ("cdr", b"\0\1\0\0\1\0"),
+        ("cdr", b"\0\1\0\0" + 16 * b"\xff"),
+    ],
+)
+def test_a_message_that_is_damaged_is_named_by_topic_and_time(
+    tmp_path: Path, encoding: str, data: bytes
+) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/JointState", "ros2msg", b"")
+        writer.add_message(writer.register_channel("/js", encoding, schema), 2_500_000_000, data, 0)
+        writer.finish()
+    words = rf"topic /js: the message of 2\.500 s is damaged, or no JointState as {encoding}"
+    with pytest.raises(DataFileError, match=words):
+        read_log(tmp_path / "a.mcap", JOINTS)
+
+
+@pytest.mark.parametrize(
     ("joints", "encoding", "words"),
     [
         (("hip",), "cdr", "no JointState with position and effort of hip; there are elbow, grip, shoulder"),

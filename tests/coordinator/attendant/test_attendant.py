@@ -27,6 +27,7 @@ class Story:
         self.now_s = 0.0
         self.said: list[tuple[float, str]] = []
         self.warned: list[tuple[float, str]] = []
+        self.remarks: list[str] = []
         self.present: Mapping[str, int] = ARM
         self.findings: Sequence[Finding] = ()
         self.holders: Mapping[str, str] = {}
@@ -40,6 +41,7 @@ class Story:
             step = self.attendant.look(seen)
             self.warned += [(self.now_s, line) for line in step.warn]
             self.said += [(self.now_s, line) for line in (*step.say, *step.warn)]
+            self.remarks += step.remarks
             if step.measure is not None:
                 return step.measure
         return None
@@ -132,6 +134,20 @@ def test_a_robot_that_is_switched_off_and_on_is_no_other_robot() -> None:
         "modules are on the network again",
         "the robot was off, and is as it is known",
     ]
+
+
+def test_a_robot_that_is_switched_on_later_is_waited_for_and_has_not_changed() -> None:
+    story = Story()
+    story.present = {}
+    assert story.goes_on(600.0) is None
+    assert story.remarks == ["waits for the robot: no module is on the network yet"]
+    story.present = ARM
+    assert story.goes_on(600.0) is None
+    assert story.said == []
+    # Once it was there, it is gone when it is gone.
+    story.present = {}
+    story.goes_on(60.0)
+    assert [line for _, line in story.said] == ["no module is on the network any more"]
 
 
 def test_a_module_that_was_off_alone_may_sit_elsewhere() -> None:

@@ -140,6 +140,13 @@ def test_a_plan_keeps_to_the_room_of_the_joints_and_begins_slowly() -> None:
         room.plan(Plan(constant_velocity_rad_s=6.0), ARM.serials)
 
 
+def test_a_range_of_a_joint_that_is_misspelt_does_not_pass_for_one_of_all() -> None:
+    Workspace(box=WIDE, joints={"all": (-1.2, 1.2), ELBOW: (-0.4, 0.6)}).check_joints(ARM.serials)
+    wrong = Workspace(box=WIDE, joints={"all": (-1.2, 1.2), "elbw": (-0.4, 0.6)})
+    with pytest.raises(UsageError, match=r"ranges of elbw, which the robot does not have: .*elbow"):
+        wrong.check_joints(ARM.serials)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

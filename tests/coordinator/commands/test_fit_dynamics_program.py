@@ -204,7 +204,10 @@ def test_gravity_is_what_one_says(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--terms", "stiction"), "terms 'stiction': known are inertia, viscous, coulomb, offset, load,"),
+        (("--terms", "stiction"), "--terms 'stiction': known are inertia, viscous, coulomb, offset, load,"),
+        (("--tried", "stribek"), "--tried 'stribek': known are inertia, viscous, coulomb, offset, load,"),
+        (("--html", "/tmp"), "/tmp: is a folder; name the file to write"),
+        (("--cutoff", "0"), "cutoff_hz 0.0 is outside 0 to 100.0"),
         (("--coupled", "1"), "coupled '1': it must be two different joints"),
         (("--coupled", "swing,hip"), "coupled: no joint 'hip'; the joints are 1 to 2: swing, knee"),
         (("--coupled", "2,2"), "coupled '2,2': it must be two different joints"),

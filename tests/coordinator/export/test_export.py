@@ -27,7 +27,7 @@ from coordinator.export.instants import at_instants
 from coordinator.export.ros2 import Ros2Writer, ros_name
 from coordinator.main import app
 from coordinator.recording.journal import JournalEvent
-from coordinator.recording.recording import Entry
+from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import RESULT, SESSION, URDF, load_recording
 from coordinator.recording.session_file import SessionWriter
 from coordinator.synchronisation.signals import Signals
@@ -359,6 +359,18 @@ def test_lost_samples_and_damaged_places_are_said(folder: Path, wire: SimpleName
     missing = "\n".join(read_exported(folder).missing)
     assert "session.mcap is damaged from byte" in missing
     assert f"of {ROWS} samples were lost" in missing
+
+
+def test_samples_from_before_a_module_booted_anew_are_said_to_be_left_out(wire: SimpleNamespace) -> None:
+    recording = Recording()
+    recording.add(
+        wire.publication(Leaf.FEEDBACK, wire.feedback(ELBOW, boot=9, rows=module_rows(ELBOW, 0)[:500]), 1)
+    )
+    recording.modules[ELBOW].has_answered = True
+    for entry in entries(wire):
+        recording.add(entry)
+    missing = [text for text in exported(recording, None, []).missing if "boot" in text]
+    assert missing == [f"{ELBOW}: 500 samples of an earlier boot are left out, before it booted anew"]
 
 
 def test_where_nothing_can_be_exported_it_is_said_why(tmp_path: Path, wire: SimpleNamespace) -> None:

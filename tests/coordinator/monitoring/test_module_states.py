@@ -384,3 +384,20 @@ def test_a_recording_has_no_modules_to_show() -> None:
     done = CliRunner().invoke(app, ["monitor", "--recording", "session.mcap"])
     assert done.exit_code == 2
     assert "--recording needs a baseline" in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--alarms-per-hour", "7"), "--alarms-per-hour is of findings, which need a baseline"),
+        (
+            ("a_run", "--recording", "a.mcap", "--for", "5"),
+            "--for and --speed are of a robot that is monitored",
+        ),
+        (("a_run", "--recording", "a.mcap", "--speed", "2"), "a --recording is read whole"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(arguments: tuple[str, ...], words: str) -> None:
+    done = CliRunner().invoke(app, ["monitor", *arguments])
+    assert done.exit_code == 2, done.output
+    assert words in " ".join(done.output.split())

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.recording.recording import RoundTrip
-from coordinator.synchronisation.round_trips import map_clock, map_clocks
+from coordinator.recording.recording import Recording, RoundTrip
+from coordinator.synchronisation.round_trips import BootClocks, map_clock, map_clocks
 from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 
@@ -53,6 +53,28 @@ def test_even_trips_without_jitter_give_the_clock_to_the_nanosecond() -> None:
     assert clock_map.to_session(np.array([5 * MS]))[0] == pytest.approx(MS, abs=1)
     assert abs(clock_map.drift) < 1e-12
     assert clock_map.sigma_ns == pytest.approx(MS / np.sqrt(3.0))
+
+
+def test_before_and_after_a_module_boots_its_rows_follow_the_clock_of_that_boot() -> None:
+    whole, so_far = Recording(), Recording()
+    for serial, boot, offset_ms in (("A", 1, 50), ("B", 1, -70), ("B", 2, 90_000)):
+        record = whole.module(serial, boot)
+        record.has_answered = True
+        record.round_trips += _trips(boot, 60.0, offset_ms * MS, 0.0)
+    whole.module("B", 3)
+    clocks = BootClocks(whole, ("A", "B"))
+    so_far.module("A", 1)
+    assert clocks.of(so_far) is None
+    for boot, offset_ms in ((1, -70), (2, 90_000)):
+        so_far.module("B", boot)
+        maps = clocks.of(so_far)
+        assert maps is not None
+        at_ns = np.array([30_000 * MS])
+        apart_ns = maps["B"].to_session(at_ns)[0] - maps["A"].to_session(at_ns)[0]
+        assert apart_ns == pytest.approx((offset_ms - 50) * MS, abs=MS)
+    # The third boot answered no request.
+    so_far.module("B", 3)
+    assert clocks.of(so_far) is None
 
 
 def test_over_a_few_seconds_no_drift_is_read_out_of_jitter() -> None:

@@ -182,6 +182,8 @@ def test_hebi_py_moves_it_as_we_do_before_and_after_our_writer(tmp_path: Path, t
         ("<robot><end-effector type='X5Parallel' mass='1'/></robot>", "which only those of type Custom have"),
         ("<robot><bracket type='X9'/></robot>", "<bracket> of type 'X9'; known are X5LightRight"),
         ("<robot><rigid-body mass='1' output_rot='1 0 0'/></robot>", "is no rotation"),
+        ("<robot rot='1 0 0 0 1 0 0 0 -1'><actuator type='X5-9'/></robot>", "is no rotation"),
+        ("<robot><link type='X5' extension='Rx(pi)' twist='0'/></robot>", "is a rotation, not a number"),
         ("<robot><rigid-body mass='1' output_trans='1 0'/></robot>", "has 2 numbers, not 3"),
         ("<robot><rigid-body mass='-1'/></robot>", "expected at least 0"),
         ("<robot><end-effector type='R8Parallel'/></robot>", "known are Custom, X5Parallel"),
