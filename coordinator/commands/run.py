@@ -71,7 +71,7 @@ def run(
     --json writes the same document as result.json. With --viewer serve its page is served on after the end,
     until Ctrl-C.
     Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 5 a module took no part or
-    sensors are sick, and the result is without these modules, or there is none; 130 interrupted.
+    sensors are faulty, and the result is without these modules, or there is none; 130 interrupted.
     """
     place = at.place()
     config = RunConfig(
@@ -106,7 +106,7 @@ def replay(
 ) -> None:
     """Compute the result of a run again from its recording, without a robot.
 
-    Exit codes: 5 a module took no part, sensors are sick or the recording is damaged, others as of `run`.
+    Exit codes: 5 a module took no part, sensors are faulty or the recording is damaged, others as of `run`.
     """
     session = session / SESSION if session.is_dir() else session
     if not session.is_file():

@@ -71,7 +71,8 @@ def test_closing_ends_the_running_job_and_drops_the_waiting_ones() -> None:
 
     def slow() -> Finding:
         started.set()
-        time.sleep(0.05)
+        # Closing begins meanwhile.
+        time.sleep(0.3)
         return _finding("running")
 
     worker.submit(slow, lambda f: findings.append(f.joint))

@@ -342,7 +342,7 @@ def test_a_stop_does_not_wait_for_a_module_that_comes_and_goes(
     wire: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A module announces itself and leaves all the time, so that the search for others takes its longest."""
-    monkeypatch.setattr("coordinator.live_robot.discovery.MAX_S", 1.5)
+    monkeypatch.setattr("coordinator.live_robot.discovery.MAX_S", 2.0)
     sent_s: list[float] = []
 
     class Restless(Robot):
@@ -372,10 +372,9 @@ def test_a_stop_does_not_wait_for_a_module_that_comes_and_goes(
     robot: Any = Restless(wire, ("B", "A"))
     begun_s = time.monotonic()
     stopped, _ = stop_robot(robot, "arm", "tester", QUICK._replace(quiet_s=0.2))
-    assert time.monotonic() - begun_s > 1.0
+    # Both were stopped while the search still went on.
     assert {"A", "B"} <= {*stopped}
-    assert sent_s[0] < 0.5
-    assert sent_s[1] < 0.5
+    assert sent_s[1] < 1.0 < 2.0 <= time.monotonic() - begun_s
 
 
 def test_a_led_is_lit_only_if_the_module_itself_says_so(wire: Any) -> None:
