@@ -36,8 +36,8 @@ def check_robot(
     """Measure a robot again in a short run, and say which of its links changed since an earlier run.
 
     Writes check.json. Exit codes: 0 nothing changed, 4 a link or the modules changed, 5 in either run a
-    module took no part, sensors are faulty or the recording is damaged, so that changes may not be the robot's,
-    others as of `run`.
+    module took no part, sensors are faulty or the recording is damaged, so that changes may not be the
+    robot's, others as of `run`.
     """
     before = load_baseline(baseline)
     after = measured_again(before, at, again, check_plan)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -10,12 +9,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sim.processes.fleet_figures import (
-    OPEN_FILES_SHARE,
     FleetFigures,
     Reading,
     missed,
+    near_limits,
     of_kind,
     percentiles_ms,
+    read_limits,
     read_process,
 )
 from sim.processes.fleet_member import READY, START_TIMEOUT_S, Heard
@@ -132,22 +132,21 @@ def _measure(
     config: FleetConfig, children: dict[str, list[Child]], report: Callable[[str], None]
 ) -> FleetFigures:
     before, start_s = _read(children), time.monotonic()
-    broke: list[str] = []
+    limits, reached = read_limits(), dict[str, str]()
     served = [child for kind in ("router", "world", "agent") for child in children[kind]]
     while (left_s := start_s + config.seconds - time.monotonic()) > 0.0:
         time.sleep(min(1.0, left_s))
         _check_alive([*served, *children["coordinator"]] if left_s > 1.0 else served)
+        after, now_s = _read(children), time.monotonic() - start_s
+        for what, text in near_limits([one for each in after.values() for one in each], limits).items():
+            reached.setdefault(what, f"{text} after {now_s:.0f} s")
     after, spent_s = _read(children), time.monotonic() - start_s
-    allowed = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    most = max(reading.sockets for readings in after.values() for reading in readings)
-    if most > OPEN_FILES_SHARE * allowed:
-        broke.append(f"sockets: {most} of {allowed} open files in one process")
     report("collecting what the coordinators measured")
     heard = [_heard(child) for child in children["coordinator"]]
     real_time, lost = min(each.real_time for each in heard), sum(each.rows_lost for each in heard)
     unanswered = sum(each.unanswered for each in heard)
     failed = sum(each.motions_failed for each in heard)
-    broke += missed(real_time, config.speed, lost, unanswered, failed)
+    broke = [*reached.values(), *missed(real_time, config.speed, lost, unanswered, failed)]
     p50, p99 = percentiles_ms([trip for each in heard for trip in each.round_trips_ms])
     kinds = {kind: of_kind(before[kind], after[kind], spent_s) for kind in children}
     cpu_us_per_s = 1e4 * sum(each.cpu_percent for each in kinds.values())

@@ -1,5 +1,7 @@
 """What a fleet costs and what it delivers: readings of processes, the summary, and what broke first."""
 
+import resource
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,7 +9,8 @@ import numpy as np
 
 # A robot that lags more has lost real time; a fifth of a percent is the clocks' own difference.
 HELD_REAL_TIME = 0.98
-OPEN_FILES_SHARE = 0.8
+# Of what the machine allows: beyond it the next process may not start.
+SHARE = 0.8
 
 
 class Reading(NamedTuple):
@@ -20,17 +23,32 @@ class Reading(NamedTuple):
 
 
 class KindFigures(NamedTuple):
-    """All processes of a kind: how many, CPU [% of a core], memory [MiB], threads, sockets, as sums."""
+    """All processes of a kind: how many, CPU [% of a core], memory [MiB], threads, sockets, as sums.
+
+    grown_mib: by how much their memory grew while they were measured.
+    """
 
     processes: int
     cpu_percent: float
     rss_mib: float
     threads: int
     sockets: int
+    grown_mib: float = 0.0
+
+
+class Limits(NamedTuple):
+    """What the machine allows: open files of a process, memory [MiB] and threads of all together."""
+
+    open_files: float
+    memory_mib: float
+    threads: float
 
 
 class FleetFigures(NamedTuple):
-    """What a fleet measured; `kinds` by the kind of process, `broke` in order of time.
+    """What a fleet measured, `kinds` by the kind of process.
+
+    broke: what did not hold. First what came near a limit of the machine, in order of time, then what the
+    coordinators missed over the whole time.
 
     round_trip_ms: a status request and its answer, 50 and 99 %. real_time: of the slowest robot.
     us_per_module_tick: CPU of all processes over ticks of all modules [us]. motions: of robots that move, one
@@ -87,7 +105,55 @@ def of_kind(before: list[Reading], after: list[Reading], seconds: float) -> Kind
         sum(reading.rss_mib for reading in after),
         sum(reading.threads for reading in after),
         sum(reading.sockets for reading in after),
+        sum(b.rss_mib - a.rss_mib for a, b in zip(before, after, strict=True)),
     )
+
+
+def read_limits() -> Limits:
+    """Read the limits of this process and of the group that the system counts it to."""
+    total_kib = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())[
+        "MemTotal"
+    ]
+    groups = Path("/sys/fs/cgroup")
+    return Limits(
+        _lowest([resource.getrlimit(resource.RLIMIT_NOFILE)[0]]),
+        min(
+            int(total_kib.split()[0]) / 1024.0,
+            _lowest([groups / "memory.max", groups / "memory/memory.limit_in_bytes"]) / 2**20,
+        ),
+        _lowest(
+            [
+                resource.getrlimit(resource.RLIMIT_NPROC)[0],
+                *(groups / "pids.max", groups / "pids/pids.max", Path("/proc/sys/kernel/threads-max")),
+            ]
+        ),
+    )
+
+
+def _lowest(limits: Iterable[int | Path]) -> float:
+    """Return the lowest limit; infinite where there is none: -1, "max", or no file of it."""
+    found = [float("inf")]
+    for limit in limits:
+        if isinstance(limit, Path):
+            text = limit.read_text().strip() if limit.is_file() else "max"
+            found.append(float(text) if text != "max" else float("inf"))
+        elif limit >= 0:
+            found.append(float(limit))
+    return min(found)
+
+
+def near_limits(readings: list[Reading], limits: Limits) -> dict[str, str]:
+    """Return in words what has come near a limit, by what it is."""
+    most = max(reading.sockets for reading in readings)
+    memory_mib, threads = sum(r.rss_mib for r in readings), sum(r.threads for r in readings)
+    near = {}
+    if most > SHARE * limits.open_files:
+        near["sockets"] = f"sockets: {most} of {limits.open_files:.0f} open files in one process"
+    if memory_mib > SHARE * limits.memory_mib:
+        near["memory"] = f"memory: {memory_mib:.0f} of {limits.memory_mib:.0f} MiB"
+    if threads > SHARE * limits.threads:
+        near["threads"] = f"threads: {threads} of {limits.threads:.0f}"
+    return near
 
 
 def missed(
@@ -123,6 +189,7 @@ def table_rows(figures: FleetFigures) -> list[tuple[str, ...]]:
             str(each.processes),
             f"{each.cpu_percent:.0f}",
             f"{each.rss_mib:.0f}",
+            f"{each.grown_mib:.1f}",
             str(each.threads),
             str(each.sockets),
         )

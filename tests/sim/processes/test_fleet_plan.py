@@ -1,5 +1,8 @@
 """Which processes a fleet has, how its routers hang together, and what its table says."""
 
+import math
+import os
+import resource
 from pathlib import Path
 
 import pytest
@@ -8,9 +11,13 @@ from module_agent.model.errors import UsageError
 from sim.processes.fleet_figures import (
     FleetFigures,
     KindFigures,
+    Limits,
     Reading,
     missed,
+    near_limits,
     of_kind,
+    read_limits,
+    read_process,
     summary,
     table_rows,
 )
@@ -54,12 +61,12 @@ def test_a_planned_robot_is_a_chain() -> None:
 def test_a_kind_is_the_sum_of_its_processes_and_all_the_sum_of_the_kinds() -> None:
     before, after = [Reading(1.0, 9.0, 1, 1)] * 2, [Reading(2.0, 10.0, 3, 4), Reading(4.0, 30.0, 5, 6)]
     kind = of_kind(before, after, 10.0)
-    assert kind == KindFigures(2, 40.0, 40.0, 8, 10)
+    assert kind == KindFigures(2, 40.0, 40.0, 8, 10, 22.0)
     figures = _figures(kinds={"agent": kind, "world": kind})
     assert table_rows(figures) == [
-        ("agent", "2", "40", "40", "8", "10"),
-        ("world", "2", "40", "40", "8", "10"),
-        ("all", "4", "80", "80", "16", "20"),
+        ("agent", "2", "40", "40", "22.0", "8", "10"),
+        ("world", "2", "40", "40", "22.0", "8", "10"),
+        ("all", "4", "80", "80", "44.0", "16", "20"),
     ]
 
 
@@ -75,6 +82,32 @@ def test_a_kind_is_the_sum_of_its_processes_and_all_the_sum_of_the_kinds() -> No
 )
 def test_what_did_not_hold_is_named(measured: tuple[float, float, int, int], words: list[str]) -> None:
     assert missed(*measured) == words
+
+
+def test_what_comes_near_a_limit_of_the_machine_is_named_with_both() -> None:
+    """Open files are of each process, memory and threads of all together."""
+    readings, ample = [Reading(1.0, 50.0, 4, 90), Reading(1.0, 40.0, 6, 10)], Limits(200.0, 200.0, 20.0)
+    assert near_limits(readings, ample) == {}
+    tight = Limits(100.0, 110.0, 12.0)
+    assert list(near_limits(readings, tight).values()) == [
+        "sockets: 90 of 100 open files in one process",
+        "memory: 90 of 110 MiB",
+        "threads: 10 of 12",
+    ]
+    assert list(near_limits(readings, ample._replace(threads=12.0))) == ["threads"]
+    assert near_limits(readings, Limits(math.inf, math.inf, math.inf)) == {}
+
+
+def test_the_limits_of_this_machine_hold_this_process() -> None:
+    own, limits = read_process(os.getpid(), os.sysconf("SC_CLK_TCK")), read_limits()
+    assert near_limits([own], limits) == {}
+    assert own.rss_mib < limits.memory_mib < 1e9
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (64, hard))
+    try:
+        assert read_limits().open_files == 64
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_the_summary_says_what_broke_first() -> None:
