@@ -36,6 +36,10 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
+# Of an information matrix of some dozens of parameters whose diagonal is one.
+ROUNDING = 1e-12
+
+
 class Problem(NamedTuple):
     """The samples, and what is known before of the IMUs and of the links' compliances.
 
@@ -295,7 +299,12 @@ def _eliminated(information: Array, own: Index, at: Index, inner: Array, cross: 
     Their units differ by orders of magnitude, so that their information (s, s) is scaled.
     """
     scale = 1.0 / np.sqrt(np.diag(inner))
-    lower = np.linalg.cholesky(inner * np.outer(scale, scale))
+    scaled = inner * np.outer(scale, scale)
+    try:
+        lower = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        # Beside samples without noise the prior of what they do not show is lost in rounding.
+        lower = np.linalg.cholesky(scaled + ROUNDING * np.eye(len(scaled)))
     half = solve_triangular(lower, cross * scale[:, None], lower=True)
     add_upper(information, dsyrk(-1.0, half, trans=1), at)
     through = scale[:, None] * solve_triangular(lower, half, lower=True, trans=1)

@@ -140,3 +140,18 @@ def test_equations_by_paths_are_those_of_the_whole_jacobian(
     spread = np.linalg.inv(np.eye(own) + np.outer(step, step))
     by_others = np.linalg.inv(information[own:, own:]) + through[:, :-1] @ spread @ through[:, :-1].T
     _close(found.own_covariance(spread), by_others, 1e-9)
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_what_samples_without_noise_do_not_show_is_left_to_the_prior(robots: Any, coupled: bool) -> None:
+    """At rest an IMU's scales, axes and biases have the same effects; beside sigmas of nothing at all the
+    information of the prior that tells them apart is less than the last digit of that of the samples.
+    """
+    problem, state, motion = _problem(robots, 1, 4, coupled)
+    rest = (motion[0], np.zeros_like(motion[1]), np.zeros_like(motion[2]))
+    expected, _ = _at(problem, state, rest)
+    sigmas = [np.full((3, 4), 1e-8)] * 2
+    found = normal_equations(problem, state, expected, expected.still, sigmas)
+    assert all(np.isfinite(part).all() for part in found[:5])
+    spectrum = np.linalg.eigvalsh(found.pose)
+    assert spectrum[0] > -1e-9 * spectrum[-1]
