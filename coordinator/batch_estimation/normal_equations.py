@@ -303,7 +303,7 @@ def _eliminated(information: Array, own: Index, at: Index, inner: Array, cross: 
     try:
         lower = np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
-        # Beside samples without noise the prior of what they do not show is lost in rounding.
+        # Where samples have no noise, the prior of what they do not show is lost in rounding.
         lower = np.linalg.cholesky(scaled + ROUNDING * np.eye(len(scaled)))
     half = solve_triangular(lower, cross * scale[:, None], lower=True)
     add_upper(information, dsyrk(-1.0, half, trans=1), at)
