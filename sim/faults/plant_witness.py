@@ -133,7 +133,7 @@ class PlantWitness:
                 with suppress(WireError):
                     self._answered(now_ns, parts, decode(Ack, payload))
             return
-        if endpoint in self._commanders and parts.leaf in COMMANDS:
+        if parts.leaf in COMMANDS and self._may_command(endpoint, parts.serial):
             self._sent_ns[parts.serial] = max(now_ns, self._sent_ns.get(parts.serial, now_ns))
             if kind == "sample":
                 # Nothing answers what is published: a command that is refused counts, too.
@@ -166,10 +166,19 @@ class PlantWitness:
         if acquires:
             # Nothing else ends a stop. A keep-alive of a motion that is done is accepted after it, too.
             self._stopped_ns.pop(serial, None)
+            if asker not in self._commanders.values():
+                # Without security a robot that is free is anybody's.
+                self._sent_ns[serial] = max(now_ns, self._sent_ns.get(serial, now_ns))
         if held is not None and held.boot == ack.boot and now_ns < held.until_ns and held.by != asker:
             self._note("two holders", f"module {serial} is held by {held.by} and obeys {asker}")
         since_ns = ack.t_ns if acquires or held is None else held.since_ns
         self._leases[serial] = _Held(ack.boot, asker, now_ns + ack.lease_left_ns, since_ns)
+
+    def _may_command(self, endpoint: str, serial: str) -> bool:
+        """Return whether a program's commands keep a motor on: a coordinator's, or those of who holds it."""
+        return endpoint in self._commanders or (
+            serial in self._leases and self._leases[serial].by == endpoint
+        )
 
     def _asked(self, parts: KeyParts, endpoint: str, payload: bytes) -> None:
         try:

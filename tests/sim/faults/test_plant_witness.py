@@ -108,6 +108,23 @@ def test_a_motor_that_was_only_commanded_may_not_even_brake_after_the_lifetime()
     assert armed().judged(pwm=0.018, speed_rad_s=-0.5) == {"driven too late"}
 
 
+def test_a_robot_that_is_free_is_driven_for_a_lifetime_after_who_holds_it() -> None:
+    """Without security a free module is anybody's, as seed 821473 found: not only a coordinator's."""
+    scene = armed()
+    scene.accept(Leaf.LEASE, "release")
+    scene.now_ns += LATE_NS
+    scene.accept(Leaf.LEASE, "acquire", by="stranger")
+    scene.now_ns += LIFETIME_NS // 2
+    scene.accept(Leaf.MOTION, by="stranger")
+    on = np.zeros((2, SEEN_ROWS, 1))
+    on[:, PLANT_PWM] = 0.018
+    assert scene.looked(on, scene.now_ns + LIFETIME_NS - 2 * MS) == set()
+    # What another than the holder sends prolongs nothing, nor does it after the holder's lifetime.
+    scene.now_ns += LIFETIME_NS - MS
+    scene.witness.tap(scene.now_ns, "third", "sample", key(ROBOT, SERIAL, Leaf.SETPOINT), b"")
+    assert scene.looked(on, scene.now_ns + 5 * MS) == {"driven too late"}
+
+
 @pytest.mark.parametrize(("leaf", "action"), [(Leaf.MOTION, None), (Leaf.LEASE, "renew")])
 def test_a_keep_alive_that_a_stop_has_overtaken_does_not_end_the_stop(leaf: Leaf, action: Any) -> None:
     """On a network that changes the order: the module damps its joint on, as seeds 24 and 2028 found."""
