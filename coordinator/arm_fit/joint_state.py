@@ -61,10 +61,15 @@ def _decoded(
     try:
         stamp, names, *signals = _DECODERS[encoding](message.data)
         position, velocity, effort = (
-            {name: float(value) for name, value in zip(names, signal, strict=False)} for signal in signals
+            # JSON has no NaN: encoders write null.
+            {
+                name: np.nan if value is None else float(value)
+                for name, value in zip(names, signal, strict=False)
+            }
+            for signal in signals
         )
         return float(stamp), position, velocity, effort
-    except (ValueError, TypeError, AttributeError, LookupError, struct.error) as error:
+    except (ValueError, TypeError, AttributeError, ArithmeticError, LookupError, struct.error) as error:
         at_s = _NS * message.log_time
         raise UsageError(
             f"topic {topic}: the message of {at_s:.3f} s is damaged, or no JointState as {encoding}: {error}"

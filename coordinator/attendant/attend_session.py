@@ -95,6 +95,7 @@ class AttendSession:
         self._alarms_per_hour = alarms_per_hour
         self._patience = patience
         self.changed = False
+        self.was_seen = False
 
     async def run(self, until_ns: int | None = None) -> None:
         """Attend the robot until a time [ns], or until cancelled.
@@ -140,6 +141,7 @@ class AttendSession:
 
         def looked() -> bool:
             nonlocal wanted
+            self.was_seen |= bool(messenger.alive)
             findings = monitor.finding_log.all
             seen = observation(site.clock(), messenger.alive, live.recording, findings, site.sender.name)
             wanted = self._take(attendant.look(seen))

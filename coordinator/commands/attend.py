@@ -21,7 +21,7 @@ from coordinator.runtime.event_loop import ScaledLoop
 from coordinator.runtime.event_loop import attend as attend_loop
 from coordinator.runtime.terminal import new_table, print_table
 from coordinator.torque_control.gravity_model import read_result
-from module_agent.model.errors import EXIT_FINDING, UsageError
+from module_agent.model.errors import EXIT_FINDING, RobotError, UsageError
 
 
 def utc_now() -> str:
@@ -96,6 +96,8 @@ def attend(
             attend_loop(loop, session.run(until_ns))
     finally:
         hub.transport.close()
+    if not session.was_seen:
+        raise RobotError(f"no module of robot {place.robot!r} was on the network: nothing was compared")
     if session.changed:
         raise typer.Exit(EXIT_FINDING)
 

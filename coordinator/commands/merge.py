@@ -11,7 +11,7 @@ from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_calibrations import merge_calibrations
 from coordinator.merge.merge_runs import merge_runs
 from coordinator.merge.report import MERGED, MergeReport, merge_report
-from coordinator.recording.run_folder import CALIBRATION, INFORMATION, SESSION
+from coordinator.recording.run_folder import CALIBRATION, INFORMATION, RESULT, SESSION
 from coordinator.runtime.command_line import end_if_suspect
 from coordinator.runtime.terminal import new_table, print_table, write_result
 from module_agent.model.errors import UsageError
@@ -34,7 +34,9 @@ def merge(
     """
     if len(runs) < 2:
         raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
-    if (out / SESSION).exists() or out.resolve() in [run.resolve() for run in runs]:
+    if any((out / file).exists() for file in (SESSION, RESULT)) or out.resolve() in [
+        run.resolve() for run in runs
+    ]:
         raise UsageError(
             f"{out} is the folder of a run, whose {CALIBRATION} would be lost; give another --out"
         )

@@ -20,6 +20,7 @@ from coordinator.monitoring.live_states import LiveStates
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
+from coordinator.monitoring.segments import SEGMENT_S
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import read_session
@@ -159,13 +160,23 @@ def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
     """Monitor a recorded session as if it were live."""
     serials = monitor.reference.chain.serials
     whole = load_recording(path)
-    missing = [s for s in serials if s not in whole.modules or not whole.modules[s].round_trips]
+    told = {serial for (serial, _), module in whole.past.items() if module.round_trips and module.rows.count}
+    missing = [serial for serial in serials if serial not in told]
     if missing:
         raise DataError(f"{path} has no feedback or no round trips of {', '.join(missing)}")
     looked_ns, recording, clocks = 0, Recording(), BootClocks(whole, serials)
 
+    boots: dict[str, int] = {}
+
     def look() -> None:
+        now = {s: recording.modules[s].boot for s in serials if s in recording.modules}
+        anew = [f"module {s} has booted anew" for s, boot in now.items() if boots.get(s, boot) != boot]
+        boots.update(now)
         mapped = clocks.of(recording)
+        if mapped is None and anew:
+            anew.append("what follows is not compared: there is no round trip of every module since")
+        if anew:
+            screen.report(MonitorUpdate((), (), tuple(anew)))
         if mapped is not None:
             screen.report(monitor.advance(recording, mapped))
 
@@ -182,8 +193,10 @@ def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
             for module in recording.modules.values():
                 module.rows.forget_before(module.rows.end_row - retained_rows(module))
     look()
-    if not monitor.monitored_s:
-        raise DataError(f"{path}: nothing was compared: at no time all of {', '.join(serials)} sent feedback")
+    if monitor.monitored_s < SEGMENT_S:
+        raise DataError(
+            f"{path}: nothing was compared: for no {SEGMENT_S:g} s all of {', '.join(serials)} sent feedback"
+        )
 
 
 def _monitor_live(

@@ -238,13 +238,17 @@ def _wrong_torque(scored: Score, clock_sick: frozenset[str]) -> _Wrong:
     """Say which joint's torques are predicted wrongly, in a motion that inertia was not identified from.
 
     What is claimed of the scale of a joint's torque sensor lets expect torques that are too large or too
-    small by a common factor, and no others.
+    small by a common factor: what is left without one is judged as if nothing were claimed. Of a joint whose
+    torque hardly varies a constant error looks like a factor, too.
     """
     sizes_nm, scales = scored.torque_rms_nm_per_joint or {}, scored.torque_scale_error_per_joint or {}
     sigmas = scored.torque_scale_sigma_per_joint or {}
+    errors_nm = scored.torque_rms_error_nm_per_joint or {}
     for serial, shape_nm in (scored.torque_shape_error_nm_per_joint or {}).items():
         size_nm = sizes_nm[serial]
         most_nm = max(TORQUE_NM, TORQUE_SHARE * size_nm)
+        if not sigmas[serial]:
+            shape_nm = errors_nm[serial]
         scale_nm = (scales[serial] or 0.0) * size_nm
         text = _beyond("are predicted", shape_nm, None, most_nm, "Nm off") or _beyond(
             "are predicted too large by", scale_nm, sigmas[serial] * size_nm, most_nm, "Nm"

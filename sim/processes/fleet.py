@@ -134,13 +134,20 @@ def _measure(
     before, start_s = _read(children), time.monotonic()
     limits, reached = read_limits(), dict[str, str]()
     served = [child for kind in ("router", "world", "agent") for child in children[kind]]
+    after, spent_s = before, 0.0
     while (left_s := start_s + config.seconds - time.monotonic()) > 0.0:
         time.sleep(min(1.0, left_s))
-        _check_alive([*served, *children["coordinator"]] if left_s > 1.0 else served)
-        after, now_s = _read(children), time.monotonic() - start_s
+        is_last = left_s <= 1.0
+        _check_alive(served if is_last else [*served, *children["coordinator"]])
+        try:
+            after, spent_s = _read(children), time.monotonic() - start_s
+        except LaunchError:
+            # In the last second coordinators end in order: then the reading of a second before counts.
+            if not is_last or not spent_s:
+                raise
+            _check_alive(served)
         for what, text in near_limits([one for each in after.values() for one in each], limits).items():
-            reached.setdefault(what, f"{text} after {now_s:.0f} s")
-    after, spent_s = _read(children), time.monotonic() - start_s
+            reached.setdefault(what, f"{text} after {spent_s:.0f} s")
     report("collecting what the coordinators measured")
     heard = [_heard(child) for child in children["coordinator"]]
     real_time, lost = min(each.real_time for each in heard), sum(each.rows_lost for each in heard)
@@ -174,11 +181,20 @@ def _measure(
 
 
 def _read(children: dict[str, list[Child]]) -> dict[str, list[Reading]]:
+    """Read all processes.
+
+    Raises:
+        LaunchError: one has ended.
+    """
     ticks_per_s = os.sysconf("SC_CLK_TCK")
-    return {
-        kind: [read_process(child.process.pid, ticks_per_s) for child in each]
-        for kind, each in children.items()
-    }
+    readings: dict[str, list[Reading]] = {kind: [] for kind in children}
+    for kind, each in children.items():
+        for child in each:
+            try:
+                readings[kind].append(read_process(child.process.pid, ticks_per_s))
+            except OSError as error:
+                raise LaunchError(f"{child.name} ended while it was measured") from error
+    return readings
 
 
 def _heard(coordinator: Child) -> Heard:

@@ -86,6 +86,9 @@ def read_process(pid: int, ticks_per_s: int) -> Reading:
     sockets = sum(target.startswith("socket:") for target in targets)
     cpu_s = (int(fields[11]) + int(fields[12])) / ticks_per_s
     status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
+    if "VmRSS" not in status:
+        # Its parent has not taken note of its end yet.
+        raise ProcessLookupError(f"process {pid} has ended")
     return Reading(cpu_s, int(status["VmRSS"].split()[0]) / 1024.0, int(fields[17]), sockets)
 
 
@@ -110,7 +113,7 @@ def of_kind(before: list[Reading], after: list[Reading], seconds: float) -> Kind
 
 
 def read_limits() -> Limits:
-    """Read the limits of this process and of the group that the system counts it to."""
+    """Read the limits of this process, of the machine, and of the control group that it shows, if any."""
     total_kib = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())[
         "MemTotal"
     ]

@@ -70,17 +70,20 @@ def test_wrong_usage_is_answered_with_what_would_be_right(known: Path, tmp_path:
     code, findings = watch(str(known), "--recording", str(tmp_path / "none.mcap"))
     assert code == 2
     assert "none.mcap" in findings
-    # Two seconds from the beginning, in which only a little of the feedback is there.
-    entries = list(read_session(known / "session.mcap"))
-    writer = SessionWriter(tmp_path / "short.mcap")
-    seen: set[str] = set()
-    for entry in entries:
-        writer.write(entry)
-        seen |= {s for s in ARM.serials if f"/{s}/" in entry.topic and entry.kind == "reply"}
-        if len(seen) == len(ARM.serials):
-            break
-    writer.close()
-    code, said = watch(str(known), "--recording", str(tmp_path / "short.mcap"))
-    assert code == 1
-    assert "short.mcap" in said
     assert watch(str(known), "--json", str(tmp_path / "no" / "file"), "--recording", "x")[0] == 2
+
+
+def test_a_recording_in_which_nothing_can_be_compared_is_not_a_quiet_one(known: Path, tmp_path: Path) -> None:
+    """The first module's feedback ends before that of the others begins."""
+    first, *others = ARM.serials
+    writer, begun_ns = SessionWriter(tmp_path / "apart.mcap"), 0
+    for entry in read_session(known / "session.mcap"):
+        begun_ns = begun_ns or entry.t_ns
+        is_early = entry.t_ns < begun_ns + 15_000_000_000
+        is_feedback = entry.kind == "publication" and entry.topic.endswith("/feedback")
+        if not is_feedback or is_early == (f"/{first}/" in entry.topic):
+            writer.write(entry)
+    writer.close()
+    code, said = watch(str(known), "--recording", str(tmp_path / "apart.mcap"))
+    assert code == 1, said
+    assert f"nothing was compared: for no 0.5 s all of {first}, {others[0]}" in " ".join(said.split())

@@ -90,6 +90,7 @@ def test_joint_states_are_a_recording(tmp_path: Path, encoding: str, velocity: b
         ("json", b"[1, 2]"),
         ("json", b'{"name": ["elbow"], "position": ["far"]}'),
         ("json", b'{"name": "elbow", "position": 3}'),
+        ("json", b'{"name": ["elbow"], "position": [1' + 400 * b"0" + b"]}"),
         ("cdr", b""),
         ("cdr", b"\0\1\0\0\1\0"),
         ("cdr", b"\0\1\0\0" + 16 * b"\xff"),
@@ -124,3 +125,19 @@ def test_what_is_missing_is_named(tmp_path: Path, joints: tuple[str, ...], encod
     (tmp_path / "b.mcap").write_bytes(b"no mcap at all, but long enough")
     with pytest.raises(DataFileError, match=r"b\.mcap: not an MCAP file"):
         read_log(tmp_path / "b.mcap", JOINTS)
+
+
+def test_what_other_joints_lack_is_no_damage(tmp_path: Path) -> None:
+    """JSON has no NaN: of a gripper without a torque sensor encoders write null."""
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/JointState", "ros2msg", b"")
+        topic = writer.register_channel("/js", "json", schema)
+        for k in range(5):
+            told: dict[str, list[str] | list[float | None]] = {"name": list(NAMES)}
+            told |= {key: [0.1 * k, 0.2, None] for key in ("position", "velocity", "effort")}
+            writer.add_message(topic, 2_000_000 * (k + 1), json.dumps(told).encode(), 0)
+        writer.finish()
+    log = read_log(tmp_path / "a.mcap", JOINTS)
+    np.testing.assert_allclose(log.tau_nm[:, 1], 0.1 * np.arange(5))

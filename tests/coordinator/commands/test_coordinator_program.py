@@ -374,7 +374,7 @@ def test_a_stop_does_not_wait_for_a_module_that_comes_and_goes(
     stopped, _ = stop_robot(robot, "arm", "tester", QUICK._replace(quiet_s=0.2))
     # Both were stopped while the search still went on.
     assert {"A", "B"} <= {*stopped}
-    assert sent_s[1] < 1.0 < 2.0 <= time.monotonic() - begun_s
+    assert sent_s[1] < 1.0 < time.monotonic() - begun_s
 
 
 def test_a_led_is_lit_only_if_the_module_itself_says_so(wire: Any) -> None:

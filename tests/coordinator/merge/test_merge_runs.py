@@ -26,7 +26,7 @@ from coordinator.merge.run_arrays import RunArraysError, read_held_out_arrays
 from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from coordinator.parameter_fit.systematic_errors import chain_effects, error_directions
-from coordinator.recording.run_folder import CALIBRATION, INFORMATION, SESSION
+from coordinator.recording.run_folder import CALIBRATION, INFORMATION, RESULT, SESSION
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import compress, merge
 from module_agent.model.perturbation import apply_perturbation
@@ -349,9 +349,10 @@ def test_the_command_merges_folders_and_says_by_how_much(tmp_path: Path) -> None
     assert twice.exit_code == 1
     assert "one and one are of the same recording" in " ".join(twice.output.split())
     assert not (tmp_path / "twice").exists()
-    (tmp_path / "third").mkdir()
-    (tmp_path / "third" / SESSION).write_bytes(b"")
-    for run in ("one", "third"):
+    for run, file in (("third", SESSION), ("fourth", RESULT)):
+        (tmp_path / run).mkdir()
+        (tmp_path / run / file).write_bytes(b"")
+    for run in ("one", "third", "fourth"):
         lost = CliRunner().invoke(app, ["merge", *folders, "--out", str(tmp_path / run)])
         assert lost.exit_code == 2
         assert "is the folder of a run, whose imu_calibration.npz would be lost" in " ".join(

@@ -3,6 +3,8 @@
 import math
 import os
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -98,16 +100,26 @@ def test_what_comes_near_a_limit_of_the_machine_is_named_with_both() -> None:
     assert near_limits(readings, Limits(math.inf, math.inf, math.inf)) == {}
 
 
-def test_the_limits_of_this_machine_hold_this_process() -> None:
+def test_the_limits_of_this_machine_hold_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     own, limits = read_process(os.getpid(), os.sysconf("SC_CLK_TCK")), read_limits()
     assert near_limits([own], limits) == {}
     assert own.rss_mib < limits.memory_mib < 1e9
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (64, hard))
-    try:
-        assert read_limits().open_files == 64
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    monkeypatch.setattr(resource, "getrlimit", lambda what: (64, resource.RLIM_INFINITY))
+    assert read_limits().open_files == 64
+    assert read_limits().threads <= 64
+    monkeypatch.setattr(resource, "getrlimit", lambda what: (resource.RLIM_INFINITY,) * 2)
+    assert read_limits().open_files == math.inf
+
+
+def test_a_process_that_has_ended_has_no_reading() -> None:
+    """Also one that its parent has not waited for."""
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    with pytest.raises(OSError, match=str(child.pid)):
+        read_process(child.pid, 100)
+    child.wait()
+    with pytest.raises(OSError, match=str(child.pid)):
+        read_process(child.pid, 100)
 
 
 def test_the_summary_says_what_broke_first() -> None:
