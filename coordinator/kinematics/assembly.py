@@ -35,6 +35,9 @@ RESOLVED_BELOW = 0.25
 STEPS = 60
 HALVINGS = 12
 STILL = 1e-13
+# Huber's weights: residuals beyond so many sigmas count less; the rounds of weights, which need not converge,
+# as the batch refinement goes on from there.
+HUBER, ROBUST_ROUNDS, ROBUST_GAIN = 3.0, 5, 1e-3
 
 
 class ChainFit(NamedTuple):
@@ -81,7 +84,10 @@ def assemble(
         raise ValueError(f"{len(types)} module types for {len(topology.serials)} modules")
     observations = pack(topology.serials, pairs, rests)
     size = float(np.mean([np.linalg.norm(r.specific_force_m_s2, axis=1).mean() for r in rests]))
-    chain = _refine(initial_chain(topology, types, observations, size), observations, min_gain)
+    begin = initial_chain(topology, types, observations, size)
+    chain = _refine(begin, observations, min_gain)
+    if _directions(chain, observations).min(initial=1.0) <= 0.0:
+        chain = _refine_robustly(begin, observations, min_gain)
     _check_directions(chain, observations)
     return _describe(chain, observations)
 
@@ -132,6 +138,24 @@ def _refine(chain: Chain, observations: ChainObservations, min_gain: float) -> C
     return chain
 
 
+def _refine_robustly(chain: Chain, observations: ChainObservations, min_gain: float) -> Chain:
+    """Refine where observations contradict each other by more than their sigmas, as those through many joints
+    with play do: by iteratively reweighted least squares with Huber's weights (Huber 1964, Ann. Math. Stat.
+    35, 73), an observation's axis and place each by its own residual.
+    """
+    pairs = observations.joint.size
+    for _ in range(ROBUST_ROUNDS):
+        axis, place = residuals(chain, observations)[: 4 * pairs].reshape(2, pairs, 2)
+        wider = (np.sqrt(np.maximum(np.linalg.norm(part, axis=1) / HUBER, 1.0)) for part in (axis, place))
+        by_axis, by_place = wider
+        weighted = observations._replace(
+            sigma_axis_rad=observations.sigma_axis_rad * by_axis,
+            sigma_radial_m=observations.sigma_radial_m * by_place,
+        )
+        chain = _refine(chain, weighted, max(min_gain, ROBUST_GAIN))
+    return chain
+
+
 def _stepped(chain: Chain, step: Array) -> Chain:
     tilt = skew(_level(chain) @ step[-2:])
     moved = apply_perturbation(chain, np.concatenate([np.zeros(6), step[:-2]]))
@@ -142,7 +166,7 @@ def _stepped(chain: Chain, step: Array) -> Chain:
 
 def _check_directions(chain: Chain, observations: ChainObservations) -> None:
     """Raise an AssemblyError if an axis points the other way; the residuals, being sines, do not show it."""
-    along = np.sum(predict(chain, observations).axis * observations.axis, axis=1)
+    along = _directions(chain, observations)
     if along.size and along.min() <= 0.0:
         worst = int(np.argmin(along))
         joint, observer = (chain.serials[of[worst]] for of in (observations.joint, observations.observer))
@@ -151,6 +175,11 @@ def _check_directions(chain: Chain, observations: ChainObservations) -> None:
             f"away from where the fit puts it: what {observer} saw of the joints further up does not fit one "
             "robot. Check the encoders' signs, the topology, and whether its IMU was exchanged with another's"
         )
+
+
+def _directions(chain: Chain, observations: ChainObservations) -> Array:
+    """Return the cosines between the axes that the chain predicts and those that were observed."""
+    return np.asarray(np.sum(predict(chain, observations).axis * observations.axis, axis=1))
 
 
 def _describe(chain: Chain, observations: ChainObservations) -> ChainFit:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify_kinematics
 from coordinator.identification.result import Result
 from coordinator.identification.topology_search import search_topology
 from module_agent.network_emulation.profile_file import network as network_profile
@@ -18,7 +19,7 @@ from sim import simulate
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
 from sim.robot.robot_file import load_robot, shipped_robots
 from sim.robot.robot_tree import true_chain
-from sim.scoring.chain_score import topology_differences
+from sim.scoring.chain_score import link_errors, topology_differences
 from sim.scoring.score import Score
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
@@ -161,3 +162,19 @@ def test_the_kit_arm_with_calibrated_imus_on_rigid_links_is_identified_to_its_im
         assert abs(link.link_length_error_mm) < 3.0 * link.link_length_sigma_mm
         assert link.link_length_sigma_mm < 2.0
     assert found.torque_relative_error < 0.03
+
+
+@pytest.mark.parametrize("noise", breadth("ideal", "poor"))
+def test_sixteen_modules_in_a_row_are_measured_without_any_error_and_with_every_one(noise: str) -> None:
+    """Through the play of many joints the last modules see the first axes tens of degrees off."""
+    settings = VirtualSettings(load_robot("snake16"), network_profile("lan"), 1, noise)
+    found = identify_kinematics(record_session(settings, Plan(dynamics=False)))
+    truth, serials = true_chain(load_robot("snake16")), found.fit.chain.serials
+    # Of the last ones more gives than the model has.
+    assert serials == truth.serials[: len(serials)]
+    assert len(serials) == 16 if noise == "ideal" else len(serials) >= 14
+    assert bool(found.suspicions) is (noise == "poor")
+    for child in range(1, len(serials)):
+        error = link_errors(found.fit.chain, truth, child)
+        assert error is not None
+        assert abs(error.length_m) < 5.0 * found.fit.link_length_sigma_m[child], serials[child]

@@ -13,7 +13,9 @@ from coordinator.kinematics.chain_observations import (
     DISTANCE_FLOOR_M,
     DISTANCE_FLOOR_RELATIVE,
     GRAVITY_FLOOR_RAD,
+    PairObservation,
     pack,
+    predict,
     residuals,
 )
 from module_agent.model.catalogue import CATALOGUE
@@ -260,6 +262,40 @@ def test_a_wrong_sign_of_an_axis_is_reported_and_not_fitted(robots: Any) -> None
     ]
     with pytest.raises(AssemblyError, match="M03 saw the axis of joint"):
         assemble(robots.topology(chain), types, pairs, [robots.rest(chain, positions[0])])
+
+
+def through_play(robots: Any, chain: Chain, positions: np.ndarray, seed: int) -> list[PairObservation]:
+    """Observations of which those through three joints and more err by up to 1.1 rad, and claim 0.003."""
+    rng, pairs = np.random.default_rng(seed), []
+    for pair in robots.observe(chain, positions):
+        is_far = chain.serials.index(pair.observer) - chain.serials.index(pair.joint) >= 3
+        turn = rng.normal(size=3)
+        turn *= (1.1 if is_far else 0.03) * rng.uniform(0.3, 1.0) / np.linalg.norm(turn)
+        place = rng.normal(0.0, 0.2 * np.linalg.norm(turn), 3)
+        pairs.append(
+            pair._replace(
+                axis=Rotation.from_rotvec(turn).apply(pair.axis),
+                radial_m=pair.radial_m + place,
+                sigma_axis_rad=0.003 if is_far else 0.05,
+                sigma_distance_m=0.003 if is_far else 0.02,
+            )
+        )
+    return pairs
+
+
+@pytest.mark.parametrize("seed", [13, 14])
+def test_observations_that_are_worse_than_they_claim_turn_no_axis_around(robots: Any, seed: int) -> None:
+    """As those through many joints with play: least squares would end with an axis the other way round."""
+    chain, types = robots.random(seed, joints=8, serial=True)
+    positions = robots.positions(chain, seed)
+    pairs, rests = through_play(robots, chain, positions, seed), [robots.rest(chain, positions[0])]
+    fit = assemble(robots.topology(chain), types, pairs, rests)
+    observations = pack(chain.serials, pairs, rests)
+    true, found = (predict(one, observations).axis for one in (chain, fit.chain))
+    off_deg = np.degrees(np.arccos(np.clip(np.sum(true * found, axis=1), -1.0, 1.0)))
+    # Within reach of the batch refinement; the far observations err by 40 degrees in the mean.
+    assert off_deg.max() < 30.0
+    assert np.median(off_deg) < 10.0
 
 
 def test_a_missing_rest_and_unknown_serials_are_refused(robots: Any) -> None:
