@@ -263,6 +263,13 @@ class Life:
         self._sick: dict[int, tuple[str, float, int]] = {}
         self._seq = self._motions = 0
 
+    def move(self, q_rad: float, share: float) -> None:
+        """Put all joints somewhere, and let their motors run at a share of their types' speeds."""
+        self._q[:] = q_rad
+        for k, name in enumerate(TYPES):
+            kind = module_type(name)
+            self._fast[k] = share * kind.gear_ratio * kind.max_speed_rad_s
+
     def ticks(self, count: int) -> None:
         for _ in range(count):
             self._tick += 1
@@ -349,33 +356,6 @@ class Life:
             agent.network.tell(SERIALS[k], leaf, encode(message))
 
 
-@settings(max_examples=150, deadline=None)
-@given(
-    st.lists(ACTIONS, min_size=5, max_size=40),
-    st.integers(0, 4),
-    st.sampled_from(["motor_off", "hold", "damping"]),
-    st.sampled_from([250.0, 400.0, 1000.0]),
-    st.integers(0, 2**20),
-    st.tuples(LIMITS, LIMITS, LIMITS),
-)
-def test_compiled_quiet_ticks_and_python_ticks_are_equal_to_the_bit(
-    actions: list[tuple[Any, ...]],
-    strategy: int,
-    expiry: str,
-    rate_hz: float,
-    seed: int,
-    safety: tuple[Safety, Safety, Safety],
-) -> None:
-    agents = [Agent(is_compiled, strategy, expiry, rate_hz, safety) for is_compiled in (True, False)]
-    life = Life(agents, seed)
-    life.ticks(3)
-    for k in range(3):
-        life.act(("acquire", k))
-    for action in actions:
-        life.act(action)
-    assert first_difference(agents) == ""
-
-
 STEPS: list[tuple[Any, ...]] = [
     ("aim", 0, (0.3, None, None)),
     ("motion", 1, WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=0.06, sigma_s=0.02)),
@@ -405,7 +385,7 @@ STEPS: list[tuple[Any, ...]] = [
 
 @pytest.mark.parametrize("expiry", ["motor_off", "hold", "damping"])
 def test_a_life_in_which_everything_happens_is_the_same_in_both(expiry: str) -> None:
-    """As the random lives above, in one that is always the same and takes little time."""
+    """As the random lives below, in one that is always the same and takes little time."""
     safety = (
         Safety(position_rad=(-0.5, 0.02), at_limit=("hold", "spring"), current_a=0.1),
         Safety(position_rad=(-0.05, 0.4), at_limit="motor_off", effort_nm=0.2),
@@ -488,6 +468,32 @@ def test_a_motion_that_is_stopped_expires_or_overheats_is_the_same_in_both(expir
     assert first_difference(agents) == ""
 
 
+@pytest.mark.parametrize("at_limit", ["hold", "spring", "motor_off"])
+def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(at_limit: Any) -> None:
+    """The speed that a limit allows falls with the distance, first by braking, then in proportion to it."""
+    safety = (
+        Safety(position_rad=(-0.5, 0.5), at_limit=at_limit),
+        Safety(position_rad=(-0.5, 0.5), at_limit=at_limit, effort_nm=0.2, braking_rad_s2=2.0),
+        Safety(velocity_rad_s=0.5, current_a=0.1),
+    )
+    agents = [Agent(is_compiled, 3, "hold", 250.0, safety) for is_compiled in (True, False)]
+    life = Life(agents, 6)
+    life.ticks(3)
+    stiff = {"kp": 5.0, "ki": 0.0}
+    for k in range(3):
+        life.act(("acquire", k))
+        life.act(("gains", k, 3, (stiff, {}, {})))
+    for q_rad in (-0.52, -0.49, -0.45, -0.3, -0.1, 0.1, 0.3, 0.45, 0.49, 0.52):
+        for aim_rad in (q_rad - 0.4, q_rad + 0.4):
+            for k in range(3):
+                life.act(("acquire", k))
+                life.act(("aim", k, (aim_rad, None, None)))
+            for share in np.linspace(-0.5, 0.5, 21).tolist():
+                life.move(q_rad, share)
+                life.ticks(1)
+            assert first_difference(agents) == "", (q_rad, aim_rad)
+
+
 def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     """An idle module needs its Python objects for its statuses, and for nothing else."""
     agent = Agent(True, 3, "hold", 250.0)
@@ -532,3 +538,30 @@ def test_where_something_is_to_be_done_the_rows_of_all_ticks_are_there() -> None
         life.ticks(1)
         plain, compiled = ([m.firmware.history.next_row for m in a.host.modules] for a in agents)
         assert compiled == plain
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(ACTIONS, min_size=5, max_size=40),
+    st.integers(0, 4),
+    st.sampled_from(["motor_off", "hold", "damping"]),
+    st.sampled_from([250.0, 400.0, 1000.0]),
+    st.integers(0, 2**20),
+    st.tuples(LIMITS, LIMITS, LIMITS),
+)
+def test_compiled_quiet_ticks_and_python_ticks_are_equal_to_the_bit(
+    actions: list[tuple[Any, ...]],
+    strategy: int,
+    expiry: str,
+    rate_hz: float,
+    seed: int,
+    safety: tuple[Safety, Safety, Safety],
+) -> None:
+    agents = [Agent(is_compiled, strategy, expiry, rate_hz, safety) for is_compiled in (True, False)]
+    life = Life(agents, seed)
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+    for action in actions:
+        life.act(action)
+    assert first_difference(agents) == ""
