@@ -141,10 +141,10 @@ class AttendSession:
 
         def looked() -> bool:
             nonlocal wanted
-            self.was_seen |= bool(messenger.alive)
             findings = monitor.finding_log.all
             seen = observation(site.clock(), messenger.alive, live.recording, findings, site.sender.name)
             wanted = self._take(attendant.look(seen))
+            self.was_seen = attendant.was_seen
             return wanted is not None
 
         try:

@@ -117,7 +117,7 @@ class Attendant:
         self._present_ns: int | None = None
         self._boots: dict[str, int] = {}
         self._begin_ns: int | None = None
-        self._was_seen = self._is_awaited = False
+        self.was_seen = self._is_awaited = False
         self._off = False
         self._structure: tuple[str, ...] = ()
         self._lasting: dict[Key, _Cause] = {}
@@ -133,7 +133,7 @@ class Attendant:
 
     def look(self, seen: Observation) -> Step:
         """Take in what is there now; return what to say, and what to measure."""
-        if not self._was_seen and (step := self._first(seen)) is not None:
+        if not self.was_seen and (step := self._first(seen)) is not None:
             return step
         if self._present_ns is None or seen.present:
             self._present_ns = seen.t_ns
@@ -194,7 +194,7 @@ class Attendant:
     def _first(self, seen: Observation) -> Step | None:
         """Wait for the first module; None once there is one: a robot that was not there yet has not gone."""
         if seen.present:
-            self._was_seen = True
+            self.was_seen = True
             return None
         self._begin_ns = seen.t_ns if self._begin_ns is None else self._begin_ns
         if self._is_awaited or not self._lasts(seen.t_ns, self._begin_ns, self._patience.gone_s):

@@ -72,7 +72,7 @@ def fleet(
             figures = run_fleet(config, _note)
         except LaunchError as error:
             fail(str(error), EXIT_FAILED)
-    table = new_table(None, "process | number | CPU % | MiB | grown by | threads | sockets")
+    table = new_table(None, "process | number | CPU % | MiB | grown by MiB | threads | sockets")
     for row in table_rows(figures):
         table.add_row(*row)
     kinds = {kind: each._asdict() for kind, each in figures.kinds.items()}

@@ -356,6 +356,14 @@ class Life:
             agent.network.tell(SERIALS[k], leaf, encode(message))
 
 
+def live(agents: Sequence[Agent], seed: int, actions: Sequence[tuple[Any, ...]]) -> None:
+    """Let all modules of some agents be acquired, and then what is to happen, happen."""
+    life = Life(agents, seed)
+    life.ticks(3)
+    for action in (*(("acquire", k) for k in range(3)), *actions):
+        life.act(action)
+
+
 STEPS: list[tuple[Any, ...]] = [
     ("aim", 0, (0.3, None, None)),
     ("motion", 1, WindowedSine(amplitude=0.1, frequency_hz=8.0, centre_s=0.06, sigma_s=0.02)),
@@ -392,12 +400,7 @@ def test_a_life_in_which_everything_happens_is_the_same_in_both(expiry: str) -> 
         UNCONFIGURED,
     )
     agents = [Agent(is_compiled, 3, expiry, 250.0, safety) for is_compiled in (True, False)]
-    life = Life(agents, 3)
-    life.ticks(3)
-    for k in range(3):
-        life.act(("acquire", k))
-    for action in STEPS:
-        life.act(action)
+    live(agents, 3, STEPS)
     assert first_difference(agents) == ""
 
 
@@ -558,10 +561,5 @@ def test_compiled_quiet_ticks_and_python_ticks_are_equal_to_the_bit(
     safety: tuple[Safety, Safety, Safety],
 ) -> None:
     agents = [Agent(is_compiled, strategy, expiry, rate_hz, safety) for is_compiled in (True, False)]
-    life = Life(agents, seed)
-    life.ticks(3)
-    for k in range(3):
-        life.act(("acquire", k))
-    for action in actions:
-        life.act(action)
+    live(agents, seed, actions)
     assert first_difference(agents) == ""

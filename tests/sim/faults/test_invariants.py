@@ -15,11 +15,11 @@ from coordinator.recording.run_folder import RESULT, SESSION
 from module_agent.control.safety import Safety
 from sim.faults import run, schedule
 from sim.faults.fault import Fault
-from sim.faults.invariants import check_folder
+from sim.faults.invariants import _wrong_torque, check_folder
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import SMALL_ROBOTS, PlanName, Schedule, draw, first_modules
 from sim.robot.robot_file import load_robot
-from sim.scoring.score import score
+from sim.scoring.score import Score, score
 
 ARM = ("a2085_03", 3)
 
@@ -332,3 +332,24 @@ def _displace(path: Path, serial: str) -> None:
     for row in range(3):
         truth["chain"]["imu_home"][place][row][3] += 0.05
     path.write_text(json.dumps(truth))
+
+
+@pytest.mark.parametrize(("sigma", "is_wrong"), [(0.0, True), (0.001, False)])
+def test_where_nothing_is_claimed_of_a_scale_an_error_counts_as_a_whole(sigma: float, is_wrong: bool) -> None:
+    """0.04 Nm of scale and as much of shape are within the bound of 0.05 Nm each, and beyond it together."""
+    scored = Score(
+        topology_correct=True,
+        topology_differences=[],
+        links=[],
+        unidentifiable=[],
+        tip_position_rms_mm=None,
+        tip_orientation_rms_deg=None,
+        robot_time_s=1.0,
+        wall_time_s=None,
+        torque_rms_nm_per_joint={"A": 0.5},
+        torque_rms_error_nm_per_joint={"A": math.hypot(0.04, 0.04)},
+        torque_scale_error_per_joint={"A": 0.08},
+        torque_scale_sigma_per_joint={"A": sigma},
+        torque_shape_error_nm_per_joint={"A": 0.04},
+    )
+    assert bool(_wrong_torque(scored, frozenset()).text) is is_wrong
