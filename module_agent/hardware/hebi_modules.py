@@ -170,13 +170,14 @@ class HebiModules:
         active = bool(np.isfinite(self._targets).any())
         self._off_ticks = 0 if active else self._off_ticks + 1
         brakes = [index for index in due if commands[index].brake]
-        if due != brakes:
-            self._send_gains([index for index in due if index not in brakes])
+        is_confirmed = due == brakes or self._try_gains([index for index in due if index not in brakes])
         if brakes:
             self._try_brake_gains(brakes)
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
         if active or self._may_follow:
-            self._send_targets()
+            # No target without the gains that it is for: those that are sent anew bring it along.
+            if is_confirmed:
+                self._send_targets()
         elif heard and self._lent:
             self._hand_back()
         return [link.pwm for link in self._links]
@@ -274,17 +275,32 @@ class HebiModules:
         self._targets[index] = math.nan if link.is_withheld else command[:3]
         if begins or link.is_withheld or not self._may_follow:
             link.given = None
+        if begins:
+            link.tries = 0
         if not link.follows and link.given is None:
             return False
         link.wanted = link.brake_gains if command.brake else self._information[index].gains
         is_due = link.wanted is not link.given
         return is_due and not (command.brake and self._ticks < link.brake_tick)
 
-    def _send_gains(self, indices: Sequence[int]) -> None:
-        names = ", ".join(self._links[index].serial for index in indices)
-        self._confirmed(self._with_gains(indices), f"the gains of {names}")
-        for index in indices:
-            self._links[index].given = self._links[index].wanted
+    def _try_gains(self, indices: Sequence[int]) -> bool:
+        """Send gains and all targets once; return whether they are confirmed, or else are due again.
+
+        One try a tick: while one module's answer is lost, a stop of the others waits for no more than that.
+        """
+        links = [self._links[index] for index in indices]
+        is_confirmed = self._group.send_command_with_acknowledgement(
+            self._with_gains(indices), timeout_ms=_CONFIRM_MS
+        )
+        for link in links:
+            link.given = link.wanted if is_confirmed else None
+            link.tries = 0 if is_confirmed else link.tries + 1
+        if max(link.tries for link in links) >= _CONFIRM_TRIES:
+            names = ", ".join(link.serial for link in links)
+            raise HardwareLost(
+                f"the gains of {names} are not confirmed in {_CONFIRM_TRIES} tries of {_CONFIRM_MS} ms"
+            )
+        return is_confirmed
 
     def _try_brake_gains(self, indices: Sequence[int]) -> None:
         """Send the gains to brake with once, and again after a while if they are not confirmed.
@@ -304,14 +320,15 @@ class HebiModules:
         """Return a command with the targets of the last one, and the gains that modules are to have."""
         command = self._settings()
         for index in indices:
-            write_gains(command[index], self._links[index].wanted)
+            link = self._links[index]
+            write_gains(command[index], link.wanted)
+            link.is_lent |= link.wanted is not self._own_gains[index]
         return command
 
     @property
     def _lent(self) -> list[int]:
-        """The modules that have other gains than those that they came with, by this driver."""
-        given = enumerate(zip(self._links, self._own_gains, strict=True))
-        return [index for index, (link, own) in given if link.given is not None and link.given is not own]
+        """The modules that may have other gains than those that they came with, by this driver."""
+        return [index for index, link in enumerate(self._links) if link.is_lent]
 
     def _hand_back(self) -> None:
         """Give the modules the gains that they came with, as far as they confirm it; none has a target."""
@@ -319,7 +336,7 @@ class HebiModules:
         for index in self._lent:
             write_gains(command[index], self._own_gains[index])
         for link in self._links:
-            link.given = None
+            link.given, link.is_lent = None, False
         for _ in range(_CONFIRM_TRIES):
             if self._group.send_command_with_acknowledgement(command, timeout_ms=_CONFIRM_MS):
                 return
@@ -343,12 +360,6 @@ class HebiModules:
         self._write_targets(command)
         return command
 
-    def _confirmed(self, command: Any, what: str) -> None:
-        for _ in range(_CONFIRM_TRIES):
-            if self._group.send_command_with_acknowledgement(command, timeout_ms=_CONFIRM_MS):
-                return
-        raise HardwareLost(f"{what} are not confirmed in {_CONFIRM_TRIES} tries of {_CONFIRM_MS} ms")
-
     def _apply_lifetime(self) -> None:
         # For HEBI, 0 is for ever.
         self._group.command_lifetime = max(1, min(self._lifetimes_ns) // 1_000_000)
@@ -360,7 +371,9 @@ class _Link:
     stays_off: it holds its motor off by itself, at its M-stop or at a limit. is_withheld: it is sent neither
     targets nor gains until it is to follow a target. m_stop_latches: the M-stop leaves its motor off.
     follows: its last target was one. given: the gains that were written last, None where another program may
-    have written others since; wanted: those that are to be. brake_tick: when those to brake with are due.
+    have written others since; wanted: those that are to be. tries: how often these were not confirmed.
+    brake_tick: when those to brake with are due. is_lent: whether others
+    than those that it came with were sent since it was handed back, confirmed or not.
     """
 
     def __init__(self, information: ModuleInformation):
@@ -375,6 +388,8 @@ class _Link:
         self.follows = False
         self.given: GainSet | None = None
         self.wanted = information.gains
+        self.tries = 0
+        self.is_lent = False
         self.brake_tick = 0
         self.brake_gains = default_gains(module_type(information.module_type), DEFAULT_STRATEGY)
         self._check = SampleCheck(module_type(information.module_type))

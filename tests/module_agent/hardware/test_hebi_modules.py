@@ -329,6 +329,59 @@ def test_a_stop_brakes_at_once_though_no_gains_are_confirmed(
     assert leased.driver._links[LAST].given is leased.driver._links[LAST].brake_gains
 
 
+def losing_answers(patch: pytest.MonkeyPatch, lost: int) -> list[int]:
+    """Let commands arrive whose first answers are lost; return how long was waited for each [ms]."""
+    waited: list[int] = []
+    send = Group.send_command
+
+    def answer(group: Group, command: Any, timeout_ms: int = 0) -> bool:
+        waited.append(timeout_ms)
+        return send(group, command) and len(waited) > lost
+
+    patch.setattr(Group, "send_command_with_acknowledgement", answer)
+    return waited
+
+
+def test_other_modules_have_their_ticks_while_the_answer_to_new_gains_is_lost(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited = losing_answers(monkeypatch, 2)
+    alone: list[int] = []
+    monkeypatch.setattr(Group, "send_command", lambda *_: alone.append(len(waited)) or True)
+    for tick in range(1, 4):
+        bench.tick(FORWARD)
+        # A stop that comes meanwhile waits for one answer, not for all.
+        assert len(waited) == tick
+        assert waited[-1] <= 50
+    bench.tick(FORWARD)
+    # The target comes along with the gains, and without them only when these are confirmed.
+    assert alone == [3, 3]
+
+
+def test_gains_that_are_never_confirmed_end_the_driver_with_the_modules_name(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited = losing_answers(monkeypatch, 10**6)
+    with pytest.raises(HardwareLost, match="the gains of X-00010 are not confirmed in 3 tries of 50 ms"):
+        bench.ticks(5, FORWARD)
+    assert len(waited) == 3
+
+
+def test_a_module_whose_answer_was_lost_has_its_owners_gains_in_the_end(
+    leased: Leased, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = default_gains(leased.module._kind, 4)
+    leased.module._loops.set_gains(0, own)
+    leased.boot()
+    with monkeypatch.context() as patch:
+        losing_answers(patch, 1)
+        assert leased.acquire().accepted
+        assert leased.give_gains(2).accepted
+        assert leased.module.gains.strategy == 2
+        leased.driver.close()
+    assert hebi_network.describe(leased.library, leased.group, 250.0)[LAST].gains == own
+
+
 def test_the_next_agent_and_other_programs_find_the_gains_that_the_module_came_with(leased: Leased) -> None:
     own = default_gains(leased.module._kind, 4)
     leased.module._loops.set_gains(0, own)
