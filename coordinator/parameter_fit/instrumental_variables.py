@@ -22,7 +22,12 @@ from scipy.linalg import qr
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.parameter_fit.least_squares import InertialFit, solve_information, solve_weighted
 from coordinator.parameter_fit.significance import SIGNIFICANT_F, f_statistic
-from coordinator.parameter_fit.spectrum import ESTIMATED_CHAIN_TOLERANCE, RANK_TOLERANCE, without_range
+from coordinator.parameter_fit.spectrum import (
+    ESTIMATED_CHAIN_TOLERANCE,
+    MAX_SIGMA_KG,
+    RANK_TOLERANCE,
+    without_range,
+)
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, known_scale, refine_scale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
@@ -94,7 +99,7 @@ def solve_instrumental_variables(
     for _ in range(_ROUNDS if with_departure or scale_sigma else 1):
         true = [scaled(piece, one) for piece, one in zip(information, scale.value, strict=True)]
         rigid = [_without_departure(piece, size, phi) for piece in true]
-        tests = [_significance(piece, size, independent_fraction) for piece in rigid]
+        tests = [_significance(piece, prior_phi, independent_fraction) for piece in rigid]
         left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, tests, strict=True))
         fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
         sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _MIN_NM))
@@ -130,20 +135,38 @@ def _without_departure(piece: JointInformation, size: int, phi: Array) -> JointI
     return piece._replace(r=piece.r[:, :count], z=piece.z - piece.r[:, count:] @ phi)
 
 
-def _significance(piece: JointInformation, size: int, independent_fraction: float) -> _Significance:
-    """Remove the weakest term until all are significant, with the bodies fitted as well as possible."""
+def _significance(piece: JointInformation, prior_phi: Array, independent_fraction: float) -> _Significance:
+    """Remove the weakest term until all are significant, with the bodies fitted as well as is likely.
+
+    An axis that is all but parallel to gravity shows the bodies' moments of mass by the angle between them:
+    moments of many kilogrammes would explain any offset, but no fit believes them. So all parameters are
+    normally distributed about the prior here, by `MAX_SIGMA_KG`.
+    """
+    size = len(prior_phi)
     bodies = piece.r[:, :size] * parameter_scale(size // PER_BODY)
-    terms = piece.r[:, size:]
-    (columns, target), rank = without_range(bodies, RANK_TOLERANCE, (terms, piece.z))
+    terms, torques = piece.r[:, size:], piece.z - piece.r[:, :size] @ prior_phi
+    (columns, target), rank = without_range(bodies, RANK_TOLERANCE, (terms, torques))
+    freedom = max(piece.samples - rank - len(READING_TERMS), 1)
+
+    def variance(columns: Array, target: Array, value: Array) -> float:
+        misfit = target - columns @ value
+        return (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
+
+    noise_nm = np.sqrt(variance(columns, target, np.linalg.pinv(columns) @ target))
+    likely = max(noise_nm, _MIN_NM) / MAX_SIGMA_KG * np.eye(size)
+    without = np.zeros((size, len(READING_TERMS)))
+    (columns, target), _ = without_range(
+        np.vstack([bodies, likely]),
+        RANK_TOLERANCE,
+        (np.vstack([terms, without]), np.append(torques, without[:, 0])),
+    )
     gain, spread = np.zeros(len(READING_TERMS)), np.full(len(READING_TERMS), np.inf)
     used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
-    freedom = max(piece.samples - rank - len(READING_TERMS), 1)
     while used.any():
         inverse = np.linalg.pinv(columns[:, used])
         value = inverse @ target
-        misfit = target - columns[:, used] @ value
-        variance = (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
-        spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _MIN_NM)
+        variances = np.sum(inverse**2, axis=1) * variance(columns[:, used], target, value)
+        spread[used] = np.maximum(np.sqrt(variances), _MIN_NM)
         gain[used] = f_statistic(value, spread[used])
         weakest = np.flatnonzero(used)[np.argmin(gain[used])]
         if gain[weakest] > SIGNIFICANT_F:

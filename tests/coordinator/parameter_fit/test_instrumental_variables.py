@@ -9,7 +9,7 @@ from coordinator.parameter_fit.instrumental_variables import (
     solve_instrumental_variables,
 )
 from coordinator.parameter_fit.significance import SIGNIFICANT_F
-from module_agent.model.chain import Array
+from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor
 from module_agent.signals.filtering import JointMotion, filtered_motion
@@ -25,16 +25,18 @@ FRACTION = 2.0 * CUTOFF_HZ / RATE_HZ
 SIGMA_NM = 0.02
 
 
-def swings(rng: Generator, duration_s: float = 20.0) -> tuple[Array, Array]:
+def swings(
+    rng: Generator, duration_s: float = 20.0, phi: Array = PHI, size: float = 1.0
+) -> tuple[Array, Array]:
     """All joints on sums of three sines; positions, and the true torques."""
     t = np.arange(int(duration_s * RATE_HZ))[:, None] / RATE_HZ
     q, qd, qdd = np.zeros((3, len(t), JOINTS))
-    for amplitude in (0.4, 0.2, 0.1):
+    for amplitude in (0.4 * size, 0.2 * size, 0.1 * size):
         w = 2.0 * np.pi * rng.uniform(0.3, 2.0, JOINTS)
         q += amplitude * np.sin(w * t)
         qd += amplitude * w * np.cos(w * t)
         qdd -= amplitude * w**2 * np.sin(w * t)
-    return q, torque_regressor(CHAIN, q, qd, qdd) @ PHI
+    return q, torque_regressor(CHAIN, q, qd, qdd) @ phi
 
 
 def filtered(q: Array, reading: Array) -> JointMotion:
@@ -42,8 +44,10 @@ def filtered(q: Array, reading: Array) -> JointMotion:
     return filtered_motion(times, q, None, reading, RATE_HZ, CUTOFF_HZ)
 
 
-def rows(motion: JointMotion, departure: Array | None = None) -> tuple[JointInformation, ...]:
-    rigid = torque_regressor(CHAIN, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+def rows(
+    motion: JointMotion, departure: Array | None = None, chain: Chain = CHAIN
+) -> tuple[JointInformation, ...]:
+    rigid = torque_regressor(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     terms = term_columns(motion, RATE_HZ, CUTOFF_HZ)
     parts = [rigid, terms] if departure is None else [rigid, terms, departure]
     return compress(np.concatenate(parts, axis=2), motion.tau_nm)
@@ -97,6 +101,35 @@ def test_offset_and_friction_are_found_where_they_are_and_nowhere_else(rng: Gene
     for joint, term, true in ((0, "viscous", 0.3), (1, "offset", 0.15), (2, "coulomb", 0.2)):
         value, sigma = of(found, term)
         assert abs(value[joint] - true) < 4.0 * sigma[joint] + 0.01 * true
+
+
+@pytest.mark.parametrize("tilt", [1e-4, -6e-4, 3e-3])
+def test_no_weight_on_a_vertical_axis_stands_for_an_offset(rng: Generator, tilt: float) -> None:
+    """An axis that was measured this much askew shows weights, of tonnes if need be, by that angle."""
+    # Swings so short that a weight's moment hardly varies with them.
+    q, torque = swings(rng, size=0.2)
+    torque[:, 0] += 0.04
+    motion = filtered(q, torque + SIGMA_NM * rng.normal(size=torque.shape))
+    up = np.array([np.sin(tilt), 0.0, np.cos(tilt)]) * np.linalg.norm(CHAIN.gravity)
+    assert abs(CHAIN.axis[0] @ up) == pytest.approx(np.linalg.norm(up), rel=1e-4)
+    found = solve_instrumental_variables(rows(motion, chain=CHAIN._replace(gravity=up)), PHI, FRACTION)
+    value, sigma = of(found, "offset")
+    assert found.terms.used[:, READING_TERMS.index("offset")].tolist() == [True, False, False]
+    # What a likely weight, 0.3 kg at a module's reach, makes of the angle.
+    assert value[0] == pytest.approx(0.04, abs=4.0 * sigma[0] + 9.81 * 0.3 * 0.3 * abs(tilt))
+    np.testing.assert_allclose(found.fit.torque_sigma_nm, SIGMA_NM * np.sqrt(FRACTION), rtol=0.15)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.2, 0.05])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_heavy_tool_that_the_prior_does_not_know_is_no_offset(seed: int, size: float) -> None:
+    rng = default_rng(seed)
+    tool = PHI.reshape(JOINTS, -1).copy()
+    tool[-1, :4] += 2.0 * np.array([1.0, *(CHAIN.imu_home[-1, :3, 3] + 0.15 * CHAIN.axis[-1])])
+    q, torque = swings(rng, phi=tool.ravel(), size=size)
+    motion = filtered(q, torque + SIGMA_NM * rng.normal(size=torque.shape))
+    found = solve_instrumental_variables(rows(motion), PHI, FRACTION)
+    assert not found.terms.used.any()
 
 
 @pytest.mark.parametrize("seed", range(10))
