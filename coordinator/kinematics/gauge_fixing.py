@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.null_space import Kind, Unresolved
@@ -98,13 +99,22 @@ def nearest(chain: Chain, free: Sequence[GaugeFreedom], places: Sequence[int], i
 
 
 def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:
-    """Return the chain after all free motions: offsets in m, turns in rad; a position has three amounts."""
+    """Return the chain after all free motions: offsets in m, turns in rad; a position has three amounts.
+
+    Gravity turns with what lies beyond the first axis, as all IMUs there read it: it need not be parallel to
+    the axis. Only IMUs on the base would tell, by less than their biases.
+    """
     used = 0
     for one in free:
         twists = _twists(chain, one)
+        branch = chain.descendants(one.branch)
         perturbation = np.zeros((len(chain.serials), 6))
-        perturbation[list(chain.descendants(one.branch))] = amounts[used : used + len(twists)] @ twists
+        perturbation[list(branch)] = amounts[used : used + len(twists)] @ twists
         chain = apply_perturbation(chain, perturbation.ravel())
+        apart = set(range(len(chain.serials))) - set(branch)
+        if one.kind == "rotation_about_axis" and all(chain.carrier(k) == BASE for k in apart):
+            turn = Rotation.from_rotvec(amounts[used] * chain.axis[one.joint])
+            chain = chain._replace(gravity=frozen(turn.as_matrix() @ chain.gravity))
         used += len(twists)
     return chain
 

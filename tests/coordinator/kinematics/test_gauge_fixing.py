@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.gauge_fixing import carried, gauge_fixed, gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved, name_null_space
@@ -41,6 +42,22 @@ def test_a_robot_that_has_drifted_by_what_cannot_be_known_comes_back(robots: Any
     back = moved(away, free, nearest(away, free, range(5), chain.imu_home))
     np.testing.assert_allclose(back.imu_home, chain.imu_home, atol=1e-6)
     np.testing.assert_allclose(back.point, chain.point, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_turn_about_the_first_axis_changes_no_reading_beyond_it(robots: Any, seed: int) -> None:
+    """Whatever the angle between that axis and gravity is."""
+    chain, _ = robots.random(seed, joints=4, serial=True)
+    chain = chain._replace(reversed=(False, *chain.reversed[1:]))
+    free = [one for one in gauge_freedoms(chain, hidden(chain)) if one.kind == "rotation_about_axis"]
+    chain = chain._replace(gravity=chain.gravity + np.array([0.3, -0.2, 0.1]))
+    turned = moved(chain, free, np.array([2.0]))
+    motion = np.random.default_rng(seed).normal(size=(3, 20, 4))
+    before, after = (readings_on(one, body_motions(one, *motion)) for one in (chain, turned))
+    np.testing.assert_allclose(after.gyro_rad_s[:, 1:], before.gyro_rad_s[:, 1:], atol=1e-10)
+    np.testing.assert_allclose(after.accel_m_s2[:, 1:], before.accel_m_s2[:, 1:], atol=1e-10)
+    # What is on the base tells.
+    assert np.abs(after.accel_m_s2[:, 0] - before.accel_m_s2[:, 0]).max() > 0.1
 
 
 def test_without_anything_unknown_nothing_moves(robots: Any) -> None:
