@@ -140,39 +140,49 @@ def _significance(piece: JointInformation, prior_phi: Array, independent_fractio
 
     An axis that is all but parallel to gravity shows the bodies' moments of mass by the angle between them:
     moments of many kilogrammes would explain any offset, but no fit believes them. So all parameters are
-    normally distributed about the prior here, by `MAX_SIGMA_KG`.
+    normally distributed about the prior here, by `MAX_SIGMA_KG`. The spread is by the torques alone.
     """
     size = len(prior_phi)
     bodies = piece.r[:, :size] * parameter_scale(size // PER_BODY)
     terms, torques = piece.r[:, size:], piece.z - piece.r[:, :size] @ prior_phi
     (columns, target), rank = without_range(bodies, RANK_TOLERANCE, (terms, torques))
-    freedom = max(piece.samples - rank - len(READING_TERMS), 1)
-
-    def variance(columns: Array, target: Array, value: Array) -> float:
-        misfit = target - columns @ value
-        return (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
-
-    noise_nm = np.sqrt(variance(columns, target, np.linalg.pinv(columns) @ target))
-    likely = max(noise_nm, _MIN_NM) / MAX_SIGMA_KG * np.eye(size)
-    without = np.zeros((size, len(READING_TERMS)))
+    samples = max(piece.samples - rank - len(READING_TERMS), 1) * independent_fraction
+    _, _, spread = _strongest(terms, columns, target, piece.rest, samples)
+    misfit = target - columns @ (np.linalg.pinv(columns) @ target)
+    noise_nm = max(float(np.sqrt((misfit @ misfit + piece.rest) / samples)), _MIN_NM)
+    nothing = np.zeros((size, len(READING_TERMS)))
     (columns, target), _ = without_range(
-        np.vstack([bodies, likely]),
+        np.vstack([bodies, noise_nm / MAX_SIGMA_KG * np.eye(size)]),
         RANK_TOLERANCE,
-        (np.vstack([terms, without]), np.append(torques, without[:, 0])),
+        (np.vstack([terms, nothing]), np.append(torques, nothing[:, 0])),
     )
+    gain, used, _ = _strongest(terms, columns, target, piece.rest, samples)
+    return _Significance(gain, used, spread)
+
+
+def _strongest(
+    terms: Array, columns: Array, target: Array, rest: float, samples: float
+) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Remove the weakest term until all are significant; return gains, the terms that stay, and spreads.
+
+    Args:
+        terms: (k, 4) columns. columns, target: these and the torques without what the bodies explain.
+        rest: the sum of squares that no column explains. samples: independent ones, less what is fitted.
+    """
     gain, spread = np.zeros(len(READING_TERMS)), np.full(len(READING_TERMS), np.inf)
     used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
     while used.any():
         inverse = np.linalg.pinv(columns[:, used])
         value = inverse @ target
-        variances = np.sum(inverse**2, axis=1) * variance(columns[:, used], target, value)
-        spread[used] = np.maximum(np.sqrt(variances), _MIN_NM)
+        misfit = target - columns[:, used] @ value
+        variance = (float(misfit @ misfit) + rest) / samples
+        spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _MIN_NM)
         gain[used] = f_statistic(value, spread[used])
         weakest = np.flatnonzero(used)[np.argmin(gain[used])]
         if gain[weakest] > SIGNIFICANT_F:
             break
         used[weakest] = False
-    return _Significance(gain, used, spread)
+    return gain, used, spread
 
 
 def without_used(piece: JointInformation, size: int, used: NDArray[np.bool_]) -> JointInformation:

@@ -19,7 +19,7 @@ from sim.faults.invariants import _wrong_torque, check_folder
 from sim.faults.run import Ending, run_schedule, witness_of
 from sim.faults.schedule import SMALL_ROBOTS, PlanName, Schedule, draw, first_modules
 from sim.robot.robot_file import load_robot
-from sim.scoring.score import Score, score
+from sim.scoring.score import Score
 
 ARM = ("a2085_03", 3)
 
@@ -122,17 +122,6 @@ def test_predicted_torques_are_compared_with_the_true_ones(tmp_path: Path) -> No
         assert found.startswith(f"torques of {serial} are predicted too large by {'-' if off < 0.0 else ''}")
     # By a sick clock it is not known which torques were the true ones.
     assert violation(to_and_fro_nm, clock_sick=frozenset({serial})) == ""
-
-
-def test_a_scale_within_what_is_claimed_of_the_torque_sensor_makes_no_robot_wrong(tmp_path: Path) -> None:
-    """The sensors are good to 5 %; of one the torques are predicted 5.6 % too small, 1.6 claimed sigmas."""
-    ending = ran(draw(810977), tmp_path / "run")
-    assert (ending.name, check_folder(tmp_path / "run", ending).violations) == ("result", {})
-    found = score(tmp_path / "run")
-    scales, sigmas = found.torque_scale_error_per_joint, found.torque_scale_sigma_per_joint
-    assert scales is not None
-    assert sigmas is not None
-    assert 0.05 < abs(scales["shoulder-yaw"] or 0.0) < 2.0 * sigmas["shoulder-yaw"]
 
 
 def test_of_a_link_that_no_motion_showed_no_sigma_is_claimed(tmp_path: Path) -> None:
