@@ -37,7 +37,7 @@ def with_encoder_scales(
         q, qd, qdd = (signal[:, module] for signal in joints)
         screw = np.r_[chain.axis[module], np.cross(chain.point[module], chain.axis[module])]
         twists.append(np.concatenate([np.outer(screw, signal) for signal in (q - q.mean(), qd, qdd)]))
-    scales = Displacements(tuple(modules), (True,) * len(modules), np.array(twists))
+    scales = Displacements.by_twists(tuple(modules), (True,) * len(modules), np.array(twists))
     return ComplianceJacobian(
         np.append(flex.sigmas, np.full(len(modules), ENCODER_SCALE_SIGMA)),
         flex.carried.joined(scales),

@@ -19,7 +19,7 @@ from coordinator.batch_estimation.imu_calibration import (
     information_between,
 )
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, read
-from coordinator.batch_estimation.imu_jacobian import displaced_readings, kernel_motion, padded
+from coordinator.batch_estimation.imu_jacobian import caused, displaced_readings, kernel_motion
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
 from coordinator.batch_estimation.normal_equations import (
@@ -42,7 +42,8 @@ ITERATIONS = 20
 # The last step in standard deviations: smaller ones cost time and tell nothing.
 CONVERGED_SIGMAS = 0.03
 # Fits from which others start lack what those add, links that give or hinges in their places: how often they
-# step at most, and their last step.
+# step at most, and their last step. It is enough, too, of what only the motion of the base tells: nothing is
+# claimed of that.
 COARSE_ITERATIONS, COARSE_SIGMAS = 8, 0.1
 # Directions with a larger sigma (rad or m) count as unresolved: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
@@ -148,8 +149,7 @@ def refine_chain(
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
     before = calibration if calibration is not None else catalogued(chain.serials, prior)
     flex = flex if flex is not None else rigid(len(data.q_rad))
-    carried = flex.carried._replace(twists=padded(flex.carried.twists))
-    problem = Problem(data, flex._replace(carried=carried), before, before.information()[0])
+    problem = Problem(data, flex, caused(flex.carried), before, before.information()[0])
     state = _start(problem, chain, begin)
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
@@ -161,7 +161,7 @@ def refine_chain(
             sigmas = [_spread(data, residual) for residual in expected.residuals]
         state, last, by_shaking = _stepped(problem, state, expected, sigmas, settled)
         # The first two steps are by weights that are guessed, or of a state that is far off.
-        settled = used > 2 and by_shaking < converged
+        settled = used > 2 and by_shaking < COARSE_SIGMAS
         if settled and last < converged:
             break
     return _concluded(problem, state, noise, coarse)
@@ -275,7 +275,8 @@ def _expected(problem: Problem, state: State) -> Expected:
         None if base is None else kernel_motion(body_motions(chain, *data.smooth, base), *data.smooth[:2])
     )
     carried = readings_on(chain, body_motions(chain, *data.joints, base))
-    change = displaced_readings(chain, still, problem.flex.carried, state.compliance)
+    flex = problem.flex.carried
+    change = displaced_readings(chain, still, flex, problem.displaced, state.compliance)
     change = change[..., : len(data.q_rad)].transpose(2, 0, 1)
     true = carried.gyro_rad_s + change[..., :3], carried.accel_m_s2 + change[..., 3:]
     gyro, accel = read(state.imus, *true, data.imu_rates)

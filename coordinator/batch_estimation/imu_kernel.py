@@ -30,8 +30,8 @@ class _Group(NamedTuple):
         and by u, 3 by 3 each, row by row.
     mixed: from changes in the body's frame to weighted readings, 3 by 3 each: of gyros by rates, of gyros by
         specific forces, of accelerometers by specific forces.
-    twist: a displacement [theta, u], its rate and its acceleration (6 each). signals: sine, cosine and rate
-        of a joint.
+    cause: six signals, their rates and accelerations. twist: the displacement [theta, u] that they make, its
+        rate and its acceleration. signals: sine, cosine and rate of a joint.
     change: of rate and specific force by some displacement, in the body's frame. block: of the weighted
     readings, a column of the Jacobian.
     """
@@ -40,6 +40,7 @@ class _Group(NamedTuple):
     body: Array
     slopes: Array
     mixed: Array
+    cause: Array
     twist: Array
     signals: Array
     change: Array
@@ -69,6 +70,18 @@ class Turns(NamedTuple):
     first: Index
     hinge: Array
     theta: Array
+
+
+class Caused(NamedTuple):
+    """Time-varying displacements of what lies beyond a link or a joint, by what causes them.
+
+    causes: (g, s, 18, LANES) of g groups of samples and s causes six signals, their first and second time
+        derivatives. cause: (l,) of l displacements. maps: (l, 6, 6) from those signals to turn and shift.
+    """
+
+    causes: Array
+    cause: Index
+    maps: Array
 
 
 class Carried(NamedTuple):
@@ -205,27 +218,29 @@ def fill_slopes(
     path: Path,
     bodies: Array,
     signals: Array,
-    twists: Array,
+    caused: Caused,
     numbers: Index,
     first: Index,
     mixing: Array,
     weight: Array,
     whole: bool,
+    begin: int,
     shared: Array,
     placed: Array,
 ) -> None:
-    """Write the weighted slopes of one IMU's readings at m samples, a multiple of `LANES`.
+    """Write the weighted slopes of one IMU's readings at m samples, a multiple of `LANES`, of m' or more.
 
     Args:
         path: what it depends on, k modules.
-        bodies: (n + 1, 9, m) of `fill_bodies`.
-        signals: (3, n, m) sine and cosine of the joints' positions, and their rates.
-        twists: (l, 18, m) time-varying displacements of what lies beyond some link or joint.
+        bodies: (n + 1, 9, m') of `fill_bodies`.
+        signals: (3, n, m') sine and cosine of the joints' positions, and their rates.
+        caused: l displacements.
         numbers: (p,) those of them that move the IMU. first: (k + 1,) of these numbers those from first[i] to
             first[i + 1] are of the link or the joint of the path's i-th module.
         mixing: (6, 6) from true rates and forces to readings.
-        weight: (2, m) of gyros and accelerometers.
+        weight: (2, m') of gyros and accelerometers.
         whole: whether the slopes by the modules' twists, gravity and the IMU's placement are wanted, too.
+        begin: the first sample, a multiple of `LANES`.
         shared: (at least 6 k + 3 + p, 6, m) by the modules' twists, gravity, and the p displacements; if not
             `whole`, (p, 6, m) by these.
         placed: (6, 6, m) by the IMU's own turn and displacement in its own axes.
@@ -235,9 +250,11 @@ def fill_slopes(
     top = last + 1 if path.turned else last
     group = _new_group()
     for start in range(0, shared.shape[2], LANES):
+        at = begin + start
         _set_home(group, path.home)
+        cause = -1
         for i in range(top, -1, -1):
-            _set_slopes(group, bodies, modules[i - 1] if i > 0 else count, mixing, weight, start)
+            _set_slopes(group, bodies, modules[i - 1] if i > 0 else count, mixing, weight, at)
             # One loop for columns of all kinds: what is written once is compiled once.
             own = 6 if i == top and whole else 0
             poses = own + (6 if i <= last and whole else 0)
@@ -248,7 +265,11 @@ def fill_slopes(
                 elif c < poses:
                     _set_still(group, _unit(c - own), _unit(c - own - 3))
                 elif c < twisted:
-                    _set_twisted(group, twists, numbers[first[i] + c - poses], start)
+                    p = numbers[first[i] + c - poses]
+                    if caused.cause[p] != cause:
+                        cause = caused.cause[p]
+                        _set_cause(group, caused.causes[at // LANES, cause])
+                    _set_twisted(group, caused.maps[p])
                 else:
                     _set_force(group, c - twisted)
                 _mix(group)
@@ -262,7 +283,7 @@ def fill_slopes(
                 else:
                     _write(group, shared, by_poses + c - twisted, start)
             if i > 0:
-                _step_below(group, path, signals, modules[i - 1], start)
+                _step_below(group, path, signals, modules[i - 1], at)
 
 
 @compiled
@@ -280,6 +301,7 @@ def _new_group() -> _Group:
         body=np.empty((9, LANES)),
         slopes=np.empty((18, LANES)),
         mixed=np.empty((27, LANES)),
+        cause=np.zeros((18, LANES)),
         twist=np.zeros((18, LANES)),
         signals=np.empty((3, LANES)),
         change=np.empty((6, LANES)),
@@ -396,12 +418,30 @@ def _set_placed(group: _Group, home: Array, c: int) -> None:
 
 
 @inlined
-def _set_twisted(group: _Group, twists: Array, p: int, start: int) -> None:
-    """Set the change, in the body's frame, by a time-varying displacement."""
-    seen, b, slopes, t, change = group.seen, group.body, group.slopes, group.twist, group.change
+def _set_cause(group: _Group, signals: Array) -> None:
     for row in range(18):
         for k in range(LANES):
-            t[row, k] = twists[p, row, start + k]
+            group.cause[row, k] = signals[row, k]
+
+
+@inlined
+def _set_twisted(group: _Group, by_cause: Array) -> None:
+    """Set the change, in the body's frame, by a time-varying displacement."""
+    seen, b, slopes, change = group.seen, group.body, group.slopes, group.change
+    cause, t = group.cause, group.twist
+    for row in range(6):
+        m0, m1, m2 = by_cause[row, 0], by_cause[row, 1], by_cause[row, 2]
+        m3, m4, m5 = by_cause[row, 3], by_cause[row, 4], by_cause[row, 5]
+        for d in range(0, 18, 6):
+            for k in range(LANES):
+                t[d + row, k] = (
+                    m0 * cause[d, k]
+                    + m1 * cause[d + 1, k]
+                    + m2 * cause[d + 2, k]
+                    + m3 * cause[d + 3, k]
+                    + m4 * cause[d + 4, k]
+                    + m5 * cause[d + 5, k]
+                )
     for k in range(LANES):
         w, theta, rate = (b[0, k], b[1, k], b[2, k]), (t[0, k], t[1, k], t[2, k]), (t[6, k], t[7, k], t[8, k])
         change[0, k], change[1, k], change[2, k] = _plus(_cross(w, theta), rate)

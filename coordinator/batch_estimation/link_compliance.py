@@ -61,6 +61,16 @@ class LinkLoad(NamedTuple):
     force: Array
     moment: Array
 
+    @property
+    def signals(self) -> Array:
+        """Force and moment, (6, m), and their first and second time derivatives: (18, m)."""
+        return np.concatenate([self.force, self.moment], axis=1).reshape(18, -1)
+
+    @property
+    def units(self) -> "LinkLoad":
+        """Return the load of six samples of one unit of force or moment each, without derivatives."""
+        return self._replace(force=np.eye(3, 6)[None], moment=np.eye(3, 6, 3)[None])
+
     def moved(self, shift: Array) -> "LinkLoad":
         """Return the load of a hinge that is somewhere else by (3,) metres."""
         about = self.moment - cross(np.broadcast_to(shift[:, None], self.force.shape), self.force)
@@ -196,28 +206,24 @@ COMPLIANCE_SIGMA = 30.0
 def compliance_jacobian(loads: Sequence[LinkLoad | None], samples: int) -> ComplianceJacobian:
     """Return how every link's compliance in bending and in twisting moves what it carries, m samples."""
     links = [(module, load) for module, load in enumerate(loads) if load is not None]
-    twists = [_twist(turn) for _, load in links for turn in load.turns(UNIT_RAD_NM, UNIT_RAD_NM)]
+    maps = [_map(turn) for _, load in links for turn in load.units.turns(UNIT_RAD_NM, UNIT_RAD_NM)]
     modules = tuple(module for module, _ in links for _ in range(2))
-    return _by_links(modules, np.full(len(modules), COMPLIANCE_SIGMA), twists, samples)
+    cause = tuple(place for place in range(len(links)) for _ in range(2))
+    causes = np.array([load.signals for _, load in links]).reshape(-1, 18, samples)
+    carried = Displacements(modules, (False,) * len(modules), np.array(maps).reshape(-1, 6, 6), cause, causes)
+    return ComplianceJacobian(np.full(len(modules), COMPLIANCE_SIGMA), carried, np.zeros(len(modules)))
 
 
 def _under(load: LinkLoad, pair: Array) -> Array:
-    """Return the displacement (18, m) by a load, for compliances in bending and in twisting."""
+    """Return the displacement (6, 6) by units of a load, for compliances in bending and in twisting."""
     bending, twisting = load.turns(*pair)
-    return _twist(bending) + _twist(twisting)
+    return _map(bending) + _map(twisting)
 
 
-def _twist(turn: LinkTurn) -> Array:
-    """Return the displacement (18, m) by a turn about a hinge: a turn about the origin, and a shift."""
-    shift = cross(np.broadcast_to(turn.hinge[:, None], turn.theta_rad.shape), turn.theta_rad)
-    return np.concatenate([turn.theta_rad, shift], axis=1).reshape(18, -1)
-
-
-def _by_links(
-    modules: tuple[int, ...], sigmas: Array, twists: Sequence[Array], samples: int
-) -> ComplianceJacobian:
-    carried = Displacements(modules, (False,) * len(modules), np.array(twists).reshape(-1, 18, samples))
-    return ComplianceJacobian(sigmas, carried, np.zeros(len(modules)))
+def _map(turn: LinkTurn) -> Array:
+    """Return the displacement (6, 6) by a turn under six units: a turn about the origin, and a shift."""
+    theta = turn.theta_rad[0]
+    return np.concatenate([theta, cross(np.broadcast_to(turn.hinge[:, None], theta.shape), theta)])
 
 
 def hinge_slopes(
@@ -229,22 +235,25 @@ def hinge_slopes(
     (3 l,) by how much the hinges of the loads have been moved already.
     """
     known = compliance_jacobian(loads, samples)
-    links: list[int] = []
-    twists: list[Array] = []
-    for place, module in enumerate(known.links[::2]):
+    links = known.links[::2]
+    maps = []
+    for place, module in enumerate(links):
         load = loads[module]
         assert load is not None
-        pair = UNIT_RAD_NM * compliance[2 * place : 2 * place + 2]
-        here = _under(load, pair)
-        for shift in load.shifts:
-            # Linear in the shift: a centimetre is small, and far from what numbers resolve.
-            twists.append(100.0 * (_under(load.moved(0.01 * shift), pair) - here))
-            links.append(module)
-    hinges = _by_links(tuple(links), np.tile(HINGE_SIGMAS, len(links) // 3), twists, samples)
+        units, pair = load.units, UNIT_RAD_NM * compliance[2 * place : 2 * place + 2]
+        here = _under(units, pair)
+        # Linear in the shift: a centimetre is small, and far from what numbers resolve.
+        maps += [100.0 * (_under(units.moved(0.01 * shift), pair) - here) for shift in load.shifts]
+    carried, number = known.carried, len(maps)
     return ComplianceJacobian(
-        np.concatenate([known.sigmas, hinges.sigmas]),
-        known.carried.joined(hinges.carried),
-        np.concatenate([known.taken, np.zeros(len(links)) if taken is None else taken]),
+        np.concatenate([known.sigmas, np.tile(HINGE_SIGMAS, len(links))]),
+        carried._replace(
+            modules=carried.modules + tuple(module for module in links for _ in range(3)),
+            of_joint=carried.of_joint + (False,) * number,
+            maps=np.concatenate([carried.maps, np.array(maps).reshape(-1, 6, 6)]),
+            cause=carried.cause + tuple(place for place in range(len(links)) for _ in range(3)),
+        ),
+        np.concatenate([known.taken, np.zeros(number) if taken is None else taken]),
     )
 
 
@@ -303,7 +312,8 @@ def estimated_turns(
 
 def rigid(samples: int) -> ComplianceJacobian:
     """Return the empty Jacobian of rigid links."""
-    return _by_links((), np.zeros(0), [], samples)
+    none = Displacements.by_twists((), (), np.zeros((0, 18, samples)))
+    return ComplianceJacobian(np.zeros(0), none, np.zeros(0))
 
 
 def loads_of(

@@ -7,7 +7,7 @@ Methods for Least Squares Problems, 1996, 6.3). Only where former recordings hav
 several modules are those of all eliminated together. What is left is a system of poses, gravity and links.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from coordinator.batch_estimation.imu_jacobian import (
     seen_by,
     weighted_slopes,
 )
-from coordinator.batch_estimation.imu_kernel import Path, add_upper
+from coordinator.batch_estimation.imu_kernel import Caused, Path, add_upper
 from coordinator.batch_estimation.imu_prediction import ImuReadings
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian
 from coordinator.batch_estimation.sensor_data import SensorData
@@ -43,12 +43,13 @@ ROUNDING = 1e-12
 class Problem(NamedTuple):
     """The samples, and what is known before of the IMUs and of the links' compliances.
 
-    flex: padded as the kernels take it (`imu_jacobian.padded`).
+    displaced: what the links carry, as the kernels take it.
     known: information of the IMUs' prior, over what is free of them.
     """
 
     data: SensorData
     flex: ComplianceJacobian
+    displaced: Caused
     calibration: ImuCalibration
     known: Array
 
@@ -223,42 +224,53 @@ def _share(
     k: int,
 ) -> _Share:
     data, path = problem.data, imu_path(expected.placed, k)
-    seen = seen_by(path, problem.flex.carried)
+    seen = seen_by(path, problem.flex.carried.modules, problem.flex.carried.of_joint)
     motions = np.zeros(len(data.q_rad), dtype=np.int64) if data.motion is None else data.motion
     weight = 1.0 / np.stack([sigma[:, k] for sigma in sigmas])[:, motions]
     residual = np.concatenate([part[:, k] for part in expected.residuals], axis=1).T
-    twists = problem.flex.carried.twists
-    rows, placed = weighted_slopes(path, motion, twists, seen, mixing(state.imus, k), weight, residual)
-    size = int(problem.free.sum())
-    flat = rows.reshape(len(rows), -1)
-    share = _Share(
-        layout.at(path, seen),
-        dsyrk(1.0, flat.T, trans=1),
-        np.zeros((size, len(rows))),
-        np.zeros((size, size)),
-    )
-    # The errors of an axis are its own: a block for each has a third of them.
-    for a, (free, block) in enumerate(_own_rows(problem, expected, placed, weight, k)):
-        share.cross[free] += block @ rows[:, a].T
-        share.own[np.ix_(free, free)] += block @ block.T
+    own_of, by_own = _own_slopes(problem, expected, weight, k, motion.bodies.shape[2])
+    at, count = layout.at(path, seen), own_of.shape[1]
+    shared = np.zeros((len(at), len(at)), order="F")
+    crosses, owns = np.zeros((6, count, len(at))), np.zeros((6, count, count))
+    mixed = mixing(state.imus, k)
+    blocks = weighted_slopes(path, motion, problem.displaced, seen, mixed, weight, residual)
+    for block, rows, placed in blocks:
+        shared = dsyrk(1.0, rows.reshape(len(rows), -1).T, trans=1, beta=1.0, c=shared, overwrite_c=1)
+        # The errors of an axis are its own.
+        own = by_own[..., block]
+        own[:, -len(placed) :] = placed.transpose(1, 0, 2)
+        crosses += own @ rows.transpose(1, 2, 0)
+        owns += own @ own.transpose(0, 2, 1)
+    number, size = np.cumsum(problem.free) - 1, int(problem.free.sum())
+    share = _Share(at, shared, np.zeros((size, len(at))), np.zeros((size, size)))
+    is_free = np.append(problem.free, False)
+    for parameters, cross, inner in zip(own_of, crosses, owns, strict=True):
+        kept = is_free[parameters]
+        free = number[parameters[kept]]
+        share.cross[free] += cross[kept]
+        share.own[np.ix_(free, free)] += inner[np.ix_(kept, kept)]
     return share
 
 
-def _own_rows(
-    problem: Problem, expected: Expected, placed: Array, weight: Array, k: int
-) -> Iterator[tuple[Index, Array]]:
-    """Yield, axis by axis, which of an IMU's free parameters its readings depend on, and the rows (p, m')."""
+def _own_slopes(
+    problem: Problem, expected: Expected, weight: Array, k: int, places: int
+) -> tuple[Index, Array]:
+    """Return on which of its own parameters each axis of an IMU depends, (6, p), and the slopes by them.
+
+    Of the slopes, (6, p, m') at m' places, those by the placement, the last ones, are not filled in. Axes
+    that depend on fewer errors than others have slopes of zero, by the parameter -1.
+    """
     samples, rates = weight.shape[1], problem.data.imu_rates
-    number = np.cumsum(problem.free) - 1
     true = expected.ideal.gyro_rad_s[:, k], expected.ideal.accel_m_s2[:, k]
-    placement = ERRORS + np.flatnonzero(problem.free[ERRORS:])
-    for axis in range(6):
-        errors, by_error = axis_slopes(*true, None if rates is None else rates[:, k], axis)
-        kept = problem.free[errors]
-        block = np.zeros((int(kept.sum()) + len(placement), placed.shape[2]))
-        block[: int(kept.sum()), :samples] = by_error[kept] * weight[axis // 3]
-        block[int(kept.sum()) :] = placed[placement - ERRORS, axis]
-        yield number[np.concatenate([errors[kept], placement])], block
+    each = [axis_slopes(*true, None if rates is None else rates[:, k], axis) for axis in range(6)]
+    most, placement = max(len(errors) for errors, _ in each), np.arange(ERRORS, len(problem.free))
+    parameters = np.full((6, most + len(placement)), -1)
+    parameters[:, most:] = placement
+    slopes = np.zeros((*parameters.shape, places))
+    for axis, (errors, by_error) in enumerate(each):
+        parameters[axis, : len(errors)] = errors
+        slopes[axis, : len(errors), :samples] = by_error * weight[axis // 3]
+    return parameters, slopes
 
 
 def _add_prior(problem: Problem, state: State, information: Array, poses: int) -> None:

@@ -422,7 +422,7 @@ def test_links_that_contradict_their_prior_widen_the_claim_where_residuals_are_s
     # One compliance shows as a slow turning of the last link, as large as five sigmas of its prior.
     twists = np.zeros((1, 18, samples))
     twists[0, 6] = 20.0 * GYRO_NOISE * np.sin(np.arange(samples) / 40.0)
-    flex = ComplianceJacobian(np.array([1.0]), Displacements((2,), (False,), twists), np.zeros(1))
+    flex = ComplianceJacobian(np.array([1.0]), Displacements.by_twists((2,), (False,), twists), np.zeros(1))
     seen = displaced(truth, data.joints, flex.carried, np.array([5.0])).transpose(2, 0, 1)
     data = data._replace(gyro_rad_s=data.gyro_rad_s + seen[..., :3])
     accel = data.accel_m_s2 + seen[..., 3:]

@@ -294,7 +294,7 @@ def test_a_robot_without_links_has_nothing_that_bends(robots: Any) -> None:
     assert loads == [None]
     found = compliance_jacobian(loads, len(joints[0]))
     assert found.links == rigid(len(joints[0])).links == ()
-    assert found.carried.twists.shape == (0, 18, len(joints[0]))
+    assert found.carried.causes.shape == (0, 18, len(joints[0]))
 
 
 def test_noise_of_encoders_makes_no_link_shorter_where_the_instrument_is_free_of_it(robots: Any) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.batch_estimation.imu_calibration import ImuCalibration, catalogued
 from coordinator.batch_estimation.imu_intrinsics import SIZE, mixing, slopes
-from coordinator.batch_estimation.imu_jacobian import Displacements, imu_jacobian, kernel_motion, padded
+from coordinator.batch_estimation.imu_jacobian import Displacements, caused, imu_jacobian, kernel_motion
 from coordinator.batch_estimation.imu_prediction import BodyMotion, body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian
 from coordinator.batch_estimation.normal_equations import Expected, Problem, State, normal_equations
@@ -32,7 +32,11 @@ def _problem(robots: Any, seed: int, joints: int, coupled: bool) -> tuple[Proble
     )
     links = tuple(k for k in chain.linked for _ in range(2))
     carried = Displacements(
-        (*links, 0), (*(False,) * len(links), True), padded(rng.normal(size=(len(links) + 1, 18, SAMPLES)))
+        (*links, 0),
+        (*(False,) * len(links), True),
+        rng.normal(size=(len(links) + 1, 6, 6)),
+        (*np.repeat(np.arange(len(links) // 2), 2).tolist(), len(links) // 2),
+        rng.normal(size=(len(links) // 2 + 1, 18, SAMPLES)),
     )
     flex = ComplianceJacobian(np.full(len(links) + 1, 3.0), carried, rng.normal(size=len(links) + 1))
     known = catalogued(chain.serials, UNCALIBRATED)
@@ -44,7 +48,7 @@ def _problem(robots: Any, seed: int, joints: int, coupled: bool) -> tuple[Proble
     own = known.sigma * rng.normal(size=known.mean.shape)
     # Small amounts: IMUs in their places.
     own[:, SIZE:] = 0.0
-    problem = Problem(data, flex, known, known.information()[0])
+    problem = Problem(data, flex, caused(carried), known, known.information()[0])
     return problem, State(chain, own, rng.normal(size=len(flex.links))), (q, qd, qdd)
 
 
@@ -65,7 +69,7 @@ def _dense(problem: Problem, state: State, joints: Joints, sigmas: list[Array]) 
         displaced(
             state.chain,
             joints,
-            problem.flex.carried._replace(twists=problem.flex.carried.twists[..., :SAMPLES]),
+            problem.flex.carried,
             unit,
         )
         for unit in np.eye(links)
