@@ -69,6 +69,10 @@ class Suspects(NamedTuple):
     scale: Array
     sick: tuple[int, ...] = ()
 
+    def freed(self, known: ImuCalibration) -> ImuCalibration:
+        """Return what is known of the IMUs if these may sit anywhere, or read anything."""
+        return known.widened(self.imus, ANYWHERE_M).with_any_scale(self.sick, SICK_SCALE)
+
 
 def refine_checked(
     chain: Chain,
@@ -105,7 +109,7 @@ def refine_checked(
     sick = sick_imus(own, known)
     if sick and _misfit(own) < _misfit(free):
         suspects = suspects._replace(sick=sick)
-        return refine_robot(own.chain, kinds, windows, prior, floor, known, suspects, noise), suspects
+        return _repeated(fitted, own, prior, known, suspects, noise), suspects
     moved = free.placement - known.placement
     away = np.abs(moved / np.hypot(free.placement_sigma, known.placement_sigma))[:, 3:].max(axis=1)
     off = _scale_sigmas(free) > SIGNIFICANT
@@ -114,6 +118,9 @@ def refine_checked(
     if not imus and not encoders:
         return refined, suspects
     suspects = Suspects(imus, encoders, np.where(off, free.encoder_scale, 0.0))
+    if not encoders:
+        return _repeated(fitted, free, prior, known, suspects, noise), suspects
+    # Other joints' motions: loads and deflections change with them.
     return refine_robot(free.chain, kinds, windows, prior, floor, known, suspects, noise), suspects
 
 
@@ -208,10 +215,10 @@ def _fitted(
     suspects = suspects or Suspects((), (), np.zeros(count))
     windows = [_rescaled(one, suspects.scale) for one in windows]
     known = calibration if calibration is not None else catalogued(chain.serials, prior)
-    known = known.widened(suspects.imus, ANYWHERE_M).with_any_scale(suspects.sick, SICK_SCALE)
+    known = suspects.freed(known)
     keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
     parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor) for one in windows]
-    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior, None, known)
+    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior, None, known, coarse=True)
     # The first IMU may have no motion to determine its delay; all IMUs are of one type.
     late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
     steps = encoder_steps(windows)
@@ -240,13 +247,36 @@ def _fitted(
     # The hinges' places are in the loads already.
     begin = hinged._replace(compliance=compliance)
     last = _with_encoders(begin, fine, prior, flex, known, suspects, noise)
-    # The last step estimates the change of the hinges' positions.
-    refined = last._replace(compliance=frozen(last.compliance + flex.taken), late_s=late_s)
-    if not suspects.encoders:
-        refined = refined._replace(
-            encoder_scale=hinged.encoder_scale, encoder_scale_sigma=hinged.encoder_scale_sigma
-        )
+    refined = _complete(last, flex, suspects, hinged._replace(late_s=late_s))
     return _Fitted(refined, last, fine, flex)
+
+
+def _complete(
+    last: Refinement, flex: ComplianceJacobian, suspects: Suspects, before: Refinement
+) -> Refinement:
+    """Return the last fit with what it has not estimated itself: the delay, and scales that were not free.
+
+    What it estimates of the hinges is a change of their places.
+    """
+    refined = last._replace(compliance=frozen(last.compliance + flex.taken), late_s=before.late_s)
+    if suspects.encoders:
+        return refined
+    return refined._replace(
+        encoder_scale=before.encoder_scale, encoder_scale_sigma=before.encoder_scale_sigma
+    )
+
+
+def _repeated(
+    fitted: _Fitted,
+    begin: Refinement,
+    prior: ImuPrior,
+    known: ImuCalibration,
+    suspects: Suspects,
+    noise: Array | None,
+) -> Refinement:
+    """Repeat the last fit, from one of the same samples, with IMUs free that are suspected."""
+    last = _with_encoders(begin, fitted.data, prior, fitted.flex, suspects.freed(known), suspects, noise)
+    return _complete(last, fitted.flex, suspects, fitted.refined)
 
 
 def _with_encoders(
