@@ -170,12 +170,15 @@ class HebiModules:
         active = bool(np.isfinite(self._targets).any())
         self._off_ticks = 0 if active else self._off_ticks + 1
         brakes = [index for index in due if commands[index].brake]
-        is_confirmed = due == brakes or self._try_gains([index for index in due if index not in brakes])
+        begin = [index for index in due if index not in brakes]
+        is_confirmed = not begin or self._try_gains(begin)
+        if not is_confirmed:
+            # No target without the gains that it is for: when these are sent anew they bring it along.
+            self._targets[begin] = math.nan
         if brakes:
             self._try_brake_gains(brakes)
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
         if active or self._may_follow:
-            # No target without the gains that it is for: those that are sent anew bring it along.
             if is_confirmed:
                 self._send_targets()
         elif heard and self._lent:
@@ -313,7 +316,7 @@ class HebiModules:
         )
         for index in indices:
             link = self._links[index]
-            link.given = link.wanted if is_confirmed else None
+            link.given, link.tries = (link.wanted if is_confirmed else None), 0
             link.brake_tick = self._ticks + _BRAKE_AGAIN_TICKS
 
     def _with_gains(self, indices: Sequence[int]) -> Any:
@@ -327,16 +330,20 @@ class HebiModules:
 
     @property
     def _lent(self) -> list[int]:
-        """The modules that may have other gains than those that they came with, by this driver."""
-        return [index for index, link in enumerate(self._links) if link.is_lent]
+        """The modules that may have other gains than those that they came with, by this driver.
+
+        One that is withheld is none: gains would set its strategy, and it would follow again.
+        """
+        return [index for index, link in enumerate(self._links) if link.is_lent and not link.is_withheld]
 
     def _hand_back(self) -> None:
         """Give the modules the gains that they came with, as far as they confirm it; none has a target."""
         command = self._settings()
         for index in self._lent:
             write_gains(command[index], self._own_gains[index])
+            self._links[index].is_lent = False
         for link in self._links:
-            link.given, link.is_lent = None, False
+            link.given = None
         for _ in range(_CONFIRM_TRIES):
             if self._group.send_command_with_acknowledgement(command, timeout_ms=_CONFIRM_MS):
                 return
@@ -372,8 +379,8 @@ class _Link:
     targets nor gains until it is to follow a target. m_stop_latches: the M-stop leaves its motor off.
     follows: its last target was one. given: the gains that were written last, None where another program may
     have written others since; wanted: those that are to be. tries: how often these were not confirmed.
-    brake_tick: when those to brake with are due. is_lent: whether others
-    than those that it came with were sent since it was handed back, confirmed or not.
+    brake_tick: when those to brake with are due. is_lent: whether others than those that it came with were
+    sent since these were handed back, confirmed or not.
     """
 
     def __init__(self, information: ModuleInformation):

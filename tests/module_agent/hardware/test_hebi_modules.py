@@ -373,12 +373,78 @@ def test_a_module_whose_answer_was_lost_has_its_owners_gains_in_the_end(
     own = default_gains(leased.module._kind, 4)
     leased.module._loops.set_gains(0, own)
     leased.boot()
+    assert leased.acquire().accepted
     with monkeypatch.context() as patch:
-        losing_answers(patch, 1)
-        assert leased.acquire().accepted
+        waited = losing_answers(patch, 1)
         assert leased.give_gains(2).accepted
-        assert leased.module.gains.strategy == 2
+        assert (len(waited), leased.module.gains.strategy) == (1, 2)
         leased.driver.close()
+    assert hebi_network.describe(leased.library, leased.group, 250.0)[LAST].gains == own
+
+
+def test_another_modules_brake_brings_no_target_without_its_gains(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.driver.receive()
+    bench.driver.send([FORWARD, MOTOR_OFF])
+    sent: list[tuple[int, float]] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            Group,
+            "send_command_with_acknowledgement",
+            lambda _, command, timeout_ms: sent.append((timeout_ms, float(command.position[LAST]))),
+        )
+        patch.setattr(
+            Group, "send_command", lambda _, command: sent.append((0, float(command.position[LAST]))) or True
+        )
+        bench.driver.receive()
+        bench.driver.send([BRAKE, FORWARD])
+    assert sent == [(50, 5.0), (5, pytest.approx(NAN, nan_ok=True))]
+
+
+@pytest.mark.parametrize("before", ["gains of its holder", "a stop"])
+def test_no_gains_are_handed_back_to_a_module_that_is_off_at_its_m_stop(leased: Leased, before: str) -> None:
+    """With gains comes a strategy, under which it would follow again."""
+    own = default_gains(leased.module._kind, 4)
+    leased.module._loops.set_gains(0, own)
+    leased.boot()
+    assert leased.acquire().accepted
+    leased.run(2)
+    if before == "a stop":
+        assert leased.ask(Leaf.STOP, Stop, why="for the test").accepted
+    else:
+        assert leased.give_gains(2).accepted
+    leased.run(20)
+    leased.module.m_stop = True
+    leased.run(2)
+    leased.strategies.clear()
+    # Its lease expires, and what HEBI's module follows; the button is released; the agent ends.
+    leased.run(300)
+    leased.module.m_stop = False
+    leased.run(50)
+    leased.driver.close()
+    leased.pass_ticks(2)
+    assert leased.strategies == {0}
+    assert leased.module.gains.strategy == 0
+
+
+def test_a_module_that_was_off_at_its_m_stop_has_its_owners_gains_after_its_next_lease(
+    leased: Leased,
+) -> None:
+    own = default_gains(leased.module._kind, 4)
+    leased.module._loops.set_gains(0, own)
+    leased.boot()
+    assert leased.acquire().accepted
+    assert leased.give_gains(2).accepted
+    leased.run(20)
+    leased.module.m_stop = True
+    leased.run(300)
+    leased.module.m_stop = False
+    leased.run(50)
+    assert leased.acquire().accepted
+    leased.run(5)
+    assert leased.module.gains.strategy == 2
+    leased.run(300)
     assert hebi_network.describe(leased.library, leased.group, 250.0)[LAST].gains == own
 
 
