@@ -31,13 +31,28 @@ def compiled_with(*modules: ModuleType, inline: bool = False) -> Callable[[Funct
 
     def decorate(function: Function) -> Function:
         kernel: Any = _kernel(function, inline)
-        # Numba compares the stamp of what it has kept with this one; without a cache there is none.
-        index = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+        # Numba compares the stamp of what it has kept with this one.
+        index = _index(kernel)
         if index is not None:
             index._source_stamp = (index._source_stamp, *map(_stamp, modules))
+            _compare_first(index)
         return cast(Function, kernel)
 
     return decorate
+
+
+def _index(kernel: Any) -> Any:
+    """Return numba's index of the code that it keeps of a kernel; None without one."""
+    return getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+
+
+def _compare_first(index: Any) -> None:
+    """Let numba compare the stamp together with its version.
+
+    It reads the index of an older file before it compares stamps, and fails where that names types of
+    arguments that are gone.
+    """
+    index._version = (numba.__version__, index._source_stamp)
 
 
 def _stamp(module: ModuleType) -> tuple[float, int]:
@@ -58,6 +73,7 @@ def inlined(function: Function) -> Function:
 def _kernel(function: Function, inline: bool = False) -> Function:
     try:
         kernel = numba.njit(cache=True, nogil=True, forceinline=inline)(function)
+        _compare_first(_index(kernel))
     except RuntimeError:
         # No folder for the code (a read-only installation without a home): compiled in each process.
         kernel = numba.njit(nogil=True, forceinline=inline)(function)
