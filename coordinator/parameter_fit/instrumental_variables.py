@@ -12,7 +12,7 @@ robot does not determine are not fitted to noise. These come from the prior; a s
 torque of them. The solver alternates: with phi known, the torque of Y - Z is subtracted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -140,43 +140,50 @@ def _significance(piece: JointInformation, prior_phi: Array, independent_fractio
 
     An axis that is all but parallel to gravity shows the bodies' moments of mass by the angle between them:
     moments of many kilogrammes would explain any offset, but no fit believes them. So all parameters are
-    normally distributed about the prior here, by `MAX_SIGMA_KG`. The spread is by the torques alone.
+    normally distributed about the prior here, by `MAX_SIGMA_KG`. Which terms are tested, their spread and the
+    noise are by the torques alone: a term that these do not determine would be a load that is not known.
     """
     size = len(prior_phi)
     bodies = piece.r[:, :size] * parameter_scale(size // PER_BODY)
     terms, torques = piece.r[:, size:], piece.z - piece.r[:, :size] @ prior_phi
     (columns, target), rank = without_range(bodies, RANK_TOLERANCE, (terms, torques))
-    samples = max(piece.samples - rank - len(READING_TERMS), 1) * independent_fraction
-    _, _, spread = _strongest(terms, columns, target, piece.rest, samples)
-    misfit = target - columns @ (np.linalg.pinv(columns) @ target)
-    noise_nm = max(float(np.sqrt((misfit @ misfit + piece.rest) / samples)), _MIN_NM)
-    nothing = np.zeros((size, len(READING_TERMS)))
+    independent = max(piece.samples - rank - len(READING_TERMS), 1) * independent_fraction
+
+    def variance(misfit: Array) -> float:
+        return (float(misfit @ misfit) + piece.rest) / independent
+
+    determined = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
+    _, _, spread = _significant(columns, target, determined, variance)
+    noise = max(variance(target - columns @ (np.linalg.pinv(columns) @ target)), _MIN_NM**2)
     (columns, target), _ = without_range(
-        np.vstack([bodies, noise_nm / MAX_SIGMA_KG * np.eye(size)]),
+        np.vstack([bodies, np.sqrt(noise) / MAX_SIGMA_KG * np.eye(size)]),
         RANK_TOLERANCE,
-        (np.vstack([terms, nothing]), np.append(torques, nothing[:, 0])),
+        (np.vstack([terms, np.zeros((size, len(READING_TERMS)))]), np.append(torques, np.zeros(size))),
     )
-    gain, used, _ = _strongest(terms, columns, target, piece.rest, samples)
+    gain, used, _ = _significant(columns, target, determined, lambda _: noise)
     return _Significance(gain, used, spread)
 
 
-def _strongest(
-    terms: Array, columns: Array, target: Array, rest: float, samples: float
+def _significant(
+    columns: Array, target: Array, tested: NDArray[np.bool_], variance: Callable[[Array], float]
 ) -> tuple[Array, NDArray[np.bool_], Array]:
-    """Remove the weakest term until all are significant; return gains, the terms that stay, and spreads.
+    """Remove the weakest of the tested terms until all are significant.
 
     Args:
-        terms: (k, 4) columns. columns, target: these and the torques without what the bodies explain.
-        rest: the sum of squares that no column explains. samples: independent ones, less what is fitted.
+        columns, target: (k, 4) of the terms, (k,) the torques, without what the bodies explain of them.
+        tested: (4,) the terms that the torques determine.
+        variance: of the noise, for what a fit leaves of the target.
+
+    Returns:
+        gains, the terms that stay, and the standard deviations, infinite where a term was not tested.
     """
     gain, spread = np.zeros(len(READING_TERMS)), np.full(len(READING_TERMS), np.inf)
-    used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
+    used = tested.copy()
     while used.any():
         inverse = np.linalg.pinv(columns[:, used])
         value = inverse @ target
-        misfit = target - columns[:, used] @ value
-        variance = (float(misfit @ misfit) + rest) / samples
-        spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _MIN_NM)
+        variances = np.sum(inverse**2, axis=1) * variance(target - columns[:, used] @ value)
+        spread[used] = np.maximum(np.sqrt(variances), _MIN_NM)
         gain[used] = f_statistic(value, spread[used])
         weakest = np.flatnonzero(used)[np.argmin(gain[used])]
         if gain[weakest] > SIGNIFICANT_F:

@@ -132,6 +132,23 @@ def test_a_heavy_tool_that_the_prior_does_not_know_is_no_offset(seed: int, size:
     assert not found.terms.used.any()
 
 
+def test_a_load_that_held_joints_do_not_tell_from_an_offset_is_none(rng: Generator) -> None:
+    """It would be wrong in any other pose, with no uncertainty left."""
+    tool = PHI.reshape(JOINTS, -1).copy()
+    tool[-1, :4] += 2.0 * np.array([1.0, *(CHAIN.imu_home[-1, :3, 3] + 0.15 * CHAIN.axis[-1])])
+    q, _ = swings(rng)
+    q[:, 1:] = 0.0
+    still = np.zeros_like(q)
+    # The first axis is vertical: its motion turns no weight.
+    qd = np.gradient(q, 1.0 / RATE_HZ, axis=0)
+    torque = torque_regressor(CHAIN, q, qd, still) @ tool.ravel()
+    assert np.abs(torque[:, 1]).min() > 2.0
+    motion = filtered(q, torque + SIGMA_NM * rng.normal(size=torque.shape))
+    found = solve_instrumental_variables(rows(motion), PHI, FRACTION)
+    assert not found.terms.used[1:, READING_TERMS.index("offset")].any()
+    assert np.isinf(found.terms.spread[1, READING_TERMS.index("offset")])
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_noise_alone_earns_no_term_a_place(seed: int) -> None:
     rng = default_rng(seed)
