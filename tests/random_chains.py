@@ -5,7 +5,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coordinator.batch_estimation.imu_jacobian import Displacements, caused, displaced_readings, kernel_motion
+from coordinator.batch_estimation.imu_jacobian import (
+    Displacements,
+    displaced_readings,
+    kernel_displacements,
+    kernel_motion,
+)
 from coordinator.batch_estimation.imu_prediction import body_motions
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
 from coordinator.kinematics.initial_guess import own_line
@@ -99,4 +104,4 @@ def displaced(
 ) -> np.ndarray:
     """The change (n, 6, m) of all readings by displacements that vary with time, to first order."""
     motion = kernel_motion(body_motions(chain, *joints), *joints[:2])
-    return displaced_readings(chain, motion, some, caused(some), amounts)[..., : len(joints[0])]
+    return displaced_readings(chain, motion, some, kernel_displacements(some), amounts)[..., : len(joints[0])]

@@ -19,7 +19,7 @@ from coordinator.batch_estimation.imu_calibration import (
     information_between,
 )
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, read
-from coordinator.batch_estimation.imu_jacobian import caused, displaced_readings, kernel_motion
+from coordinator.batch_estimation.imu_jacobian import displaced_readings, kernel_displacements, kernel_motion
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
 from coordinator.batch_estimation.normal_equations import (
@@ -149,7 +149,7 @@ def refine_chain(
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
     before = calibration if calibration is not None else catalogued(chain.serials, prior)
     flex = flex if flex is not None else rigid(len(data.q_rad))
-    problem = Problem(data, flex, caused(flex.carried), before, before.information()[0])
+    problem = Problem(data, flex, kernel_displacements(flex.carried), before, before.information()[0])
     state = _start(problem, chain, begin)
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]

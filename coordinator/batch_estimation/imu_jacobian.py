@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.batch_estimation.imu_kernel import LANES, Caused, Path, fill_slopes
+from coordinator.batch_estimation.imu_kernel import LANES, KernelDisplacements, Path, fill_slopes
 from coordinator.batch_estimation.imu_prediction import BodyMotion, stacked
 from module_agent.model.chain import Array, Chain
 
@@ -103,7 +103,7 @@ def padded(signals: Array) -> Array:
     return np.concatenate([signals, np.repeat(signals[..., -1:], missing, axis=-1)], axis=-1)
 
 
-def caused(some: Displacements) -> Caused:
+def kernel_displacements(some: Displacements) -> KernelDisplacements:
     """Return displacements as the kernels take them.
 
     What the kernels work on at a time is in one place: far apart, it takes longer to fetch than to work on.
@@ -111,7 +111,9 @@ def caused(some: Displacements) -> Caused:
     causes = padded(some.causes)
     number, rows, places = causes.shape
     grouped = causes.reshape(number, rows, places // LANES, LANES).transpose(2, 0, 1, 3)
-    return Caused(np.ascontiguousarray(grouped), np.array(some.cause, dtype=np.int64), np.array(some.maps))
+    return KernelDisplacements(
+        np.ascontiguousarray(grouped), np.array(some.cause, dtype=np.int64), np.array(some.maps)
+    )
 
 
 def imu_path(chain: Chain, module: int) -> Path:
@@ -140,7 +142,7 @@ def seen_by(path: Path, modules: Sequence[int], of_joint: Sequence[bool]) -> See
 def weighted_slopes(
     path: Path,
     motion: Motion,
-    displaced: Caused,
+    displaced: KernelDisplacements,
     seen: SeenDisplacements,
     mixing: Array,
     weight: Array,
@@ -198,18 +200,18 @@ def imu_jacobian(
     mixed = np.eye(6) if mixing is None else mixing
     seen, places = seen_by(path, (), ()), motion.bodies.shape[2]
     ((_, shared, placed),) = weighted_slopes(
-        path, motion, caused(none), seen, mixed, ones, zeros, at_once=places
+        path, motion, kernel_displacements(none), seen, mixed, ones, zeros, at_once=places
     )
     shared, placed = shared[..., :samples], placed[..., :samples]
     return ImuJacobian(tuple(path.modules.tolist()), shared[:size], shared[size:-1], placed)
 
 
 def displaced_readings(
-    chain: Chain, motion: Motion, some: Displacements, displaced: Caused, amounts: Array
+    chain: Chain, motion: Motion, some: Displacements, displaced: KernelDisplacements, amounts: Array
 ) -> Array:
     """Return by how much displacements, (p,) times their units, change all IMUs' readings, (n, 6, m').
 
-    motion: in m' places. displaced: `some`, as `caused` returns them.
+    motion: in m' places. displaced: `some`, as `kernel_displacements` returns them.
     """
     change = np.zeros((len(chain.serials), 6, motion.bodies.shape[2]))
     if not some.modules:
@@ -220,7 +222,7 @@ def displaced_readings(
     for kind, amount, one in zip(kinds, amounts, some.maps, strict=True):
         maps[different.index(kind)] += amount * one
     modules, of_joint, cause = (tuple(column) for column in zip(*different, strict=True))
-    summed = Caused(displaced.causes, np.array(cause, dtype=np.int64), maps)
+    summed = KernelDisplacements(displaced.causes, np.array(cause, dtype=np.int64), maps)
     ones, none = np.ones((2, change.shape[2])), np.empty((0, 6, change.shape[2]))
     for k in range(len(chain.serials)):
         path = imu_path(chain, k)

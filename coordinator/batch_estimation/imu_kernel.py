@@ -72,8 +72,8 @@ class Turns(NamedTuple):
     theta: Array
 
 
-class Caused(NamedTuple):
-    """Time-varying displacements of what lies beyond a link or a joint, by what causes them.
+class KernelDisplacements(NamedTuple):
+    """`Displacements` as kernels take them.
 
     causes: (g, s, 18, LANES) of g groups of samples and s causes six signals, their first and second time
         derivatives. cause: (l,) of l displacements. maps: (l, 6, 6) from those signals to turn and shift.
@@ -218,7 +218,7 @@ def fill_slopes(
     path: Path,
     bodies: Array,
     signals: Array,
-    caused: Caused,
+    displaced: KernelDisplacements,
     numbers: Index,
     first: Index,
     mixing: Array,
@@ -228,13 +228,13 @@ def fill_slopes(
     shared: Array,
     placed: Array,
 ) -> None:
-    """Write the weighted slopes of one IMU's readings at m samples, a multiple of `LANES`, of m' or more.
+    """Write the weighted slopes of one IMU's readings at m of m' samples, a multiple of `LANES`.
 
     Args:
         path: what it depends on, k modules.
         bodies: (n + 1, 9, m') of `fill_bodies`.
         signals: (3, n, m') sine and cosine of the joints' positions, and their rates.
-        caused: l displacements.
+        displaced: l displacements.
         numbers: (p,) those of them that move the IMU. first: (k + 1,) of these numbers those from first[i] to
             first[i + 1] are of the link or the joint of the path's i-th module.
         mixing: (6, 6) from true rates and forces to readings.
@@ -266,10 +266,10 @@ def fill_slopes(
                     _set_still(group, _unit(c - own), _unit(c - own - 3))
                 elif c < twisted:
                     p = numbers[first[i] + c - poses]
-                    if caused.cause[p] != cause:
-                        cause = caused.cause[p]
-                        _set_cause(group, caused.causes[at // LANES, cause])
-                    _set_twisted(group, caused.maps[p])
+                    if displaced.cause[p] != cause:
+                        cause = displaced.cause[p]
+                        _set_cause(group, displaced.causes[at // LANES, cause])
+                    _set_twisted(group, displaced.maps[p])
                 else:
                     _set_force(group, c - twisted)
                 _mix(group)

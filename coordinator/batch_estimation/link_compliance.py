@@ -63,7 +63,7 @@ class LinkLoad(NamedTuple):
 
     @property
     def signals(self) -> Array:
-        """Force and moment, (6, m), and their first and second time derivatives: (18, m)."""
+        """Force and moment, (6, m), and below them their first and second time derivatives, (18, m)."""
         return np.concatenate([self.force, self.moment], axis=1).reshape(18, -1)
 
     @property

@@ -25,7 +25,7 @@ from coordinator.batch_estimation.imu_jacobian import (
     seen_by,
     weighted_slopes,
 )
-from coordinator.batch_estimation.imu_kernel import Caused, Path, add_upper
+from coordinator.batch_estimation.imu_kernel import KernelDisplacements, Path, add_upper
 from coordinator.batch_estimation.imu_prediction import ImuReadings
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian
 from coordinator.batch_estimation.sensor_data import SensorData
@@ -49,7 +49,7 @@ class Problem(NamedTuple):
 
     data: SensorData
     flex: ComplianceJacobian
-    displaced: Caused
+    displaced: KernelDisplacements
     calibration: ImuCalibration
     known: Array
 

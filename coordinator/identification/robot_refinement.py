@@ -118,9 +118,7 @@ def refine_checked(
     if not imus and not encoders:
         return refined, suspects
     suspects = Suspects(imus, encoders, np.where(off, free.encoder_scale, 0.0))
-    if not encoders:
-        return _repeated(fitted, free, prior, known, suspects, noise), suspects
-    # Other joints' motions: loads and deflections change with them.
+    # Housings that are elsewhere, or other motions of joints: loads and deflections change with them.
     return refine_robot(free.chain, kinds, windows, prior, floor, known, suspects, noise), suspects
 
 
@@ -274,7 +272,10 @@ def _repeated(
     suspects: Suspects,
     noise: Array | None,
 ) -> Refinement:
-    """Repeat the last fit, from one of the same samples, with IMUs free that are suspected."""
+    """Repeat the last fit, from one of the same samples, with any scale and axes of IMUs that are sick.
+
+    The loads of the links, which follow from where the modules are, stay.
+    """
     last = _with_encoders(begin, fitted.data, prior, fitted.flex, suspects.freed(known), suspects, noise)
     return _complete(last, fitted.flex, suspects, fitted.refined)
 

@@ -7,7 +7,12 @@ import pytest
 
 from coordinator.batch_estimation.imu_calibration import ImuCalibration, catalogued
 from coordinator.batch_estimation.imu_intrinsics import SIZE, mixing, slopes
-from coordinator.batch_estimation.imu_jacobian import Displacements, caused, imu_jacobian, kernel_motion
+from coordinator.batch_estimation.imu_jacobian import (
+    Displacements,
+    imu_jacobian,
+    kernel_displacements,
+    kernel_motion,
+)
 from coordinator.batch_estimation.imu_prediction import BodyMotion, body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian
 from coordinator.batch_estimation.normal_equations import Expected, Problem, State, normal_equations
@@ -17,7 +22,8 @@ from module_agent.model.chain import Array
 from module_agent.model.imu_prior import UNCALIBRATED
 from tests.random_chains import displaced
 
-SAMPLES = 90
+# More than one block of them, and no multiple of the kernels' groups.
+SAMPLES = 300
 Joints = tuple[Array, Array, Array]
 
 
@@ -48,7 +54,7 @@ def _problem(robots: Any, seed: int, joints: int, coupled: bool) -> tuple[Proble
     own = known.sigma * rng.normal(size=known.mean.shape)
     # Small amounts: IMUs in their places.
     own[:, SIZE:] = 0.0
-    problem = Problem(data, flex, caused(carried), known, known.information()[0])
+    problem = Problem(data, flex, kernel_displacements(carried), known, known.information()[0])
     return problem, State(chain, own, rng.normal(size=len(flex.links))), (q, qd, qdd)
 
 
