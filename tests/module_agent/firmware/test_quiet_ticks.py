@@ -45,9 +45,9 @@ BOOT = 7
 class Scripted:
     """Wires to three modules that read what the test says."""
 
-    def __init__(self) -> None:
+    def __init__(self, types: Sequence[str] = TYPES) -> None:
         self.modules = tuple(
-            WiredModule(serial, kind, MS, 4 * MS) for serial, kind in zip(SERIALS, TYPES, strict=True)
+            WiredModule(serial, kind, MS, 4 * MS) for serial, kind in zip(SERIALS, types, strict=True)
         )
         self.samples: list[SensorSample] = []
         self.pwm: list[list[float]] = []
@@ -115,8 +115,10 @@ class Agent:
         expiry: str,
         rate_hz: float,
         safety: Sequence[Safety] = (UNCONFIGURED,) * 3,
+        types: Sequence[str] = TYPES,
     ):
-        self.wires, self.network = Scripted(), Network()
+        self.types = types
+        self.wires, self.network = Scripted(types), Network()
         loops = LoopInside(self.wires, dict(zip(SERIALS, safety, strict=True)))
         modules: Any = loops if is_compiled else Plain(loops)
         configs = [
@@ -266,7 +268,7 @@ class Life:
     def move(self, q_rad: float, share: float) -> None:
         """Put all joints somewhere, and let their motors run at a share of their types' speeds."""
         self._q[:] = q_rad
-        for k, name in enumerate(TYPES):
+        for k, name in enumerate(self._agents[0].types):
             kind = module_type(name)
             self._fast[k] = share * kind.gear_ratio * kind.max_speed_rad_s
 
@@ -315,7 +317,7 @@ class Life:
             self._voltage[k] = rest[1]
         elif what == "fast":
             # The motor runs at a share of its type's speed.
-            kind = module_type(TYPES[k])
+            kind = module_type(self._agents[0].types[k])
             self._fast[k] = rest[1] * kind.gear_ratio * kind.max_speed_rad_s
         elif what == "clock":
             self._now[k] += rest[1] * MS
@@ -344,7 +346,7 @@ class Life:
             aims = dict(zip(("position_rad", "velocity_rad_s", "effort_nm"), rest[0], strict=True))
             leaf, message = Leaf.SETPOINT, Setpoint(**command, **aims)  # type: ignore[assignment]
         else:
-            gains = default_gains(module_type(TYPES[k]), rest[0])
+            gains = default_gains(module_type(self._agents[0].types[k]), rest[0])
             names = ("position", "velocity", "effort")
             loops = {
                 name: getattr(gains, name).model_copy(update=changes)
@@ -495,6 +497,54 @@ def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(at_li
                 life.move(q_rad, share)
                 life.ticks(1)
             assert first_difference(agents) == "", (q_rad, aim_rad)
+
+
+def test_beyond_its_types_own_range_a_motor_is_off_outwards_in_both() -> None:
+    agents = [Agent(is_compiled, 1, "hold", 250.0, types=("SEA-snake",) * 3) for is_compiled in (True, False)]
+    life = Life(agents, 7)
+    life.ticks(3)
+    far = module_type("SEA-snake").range_rad
+    assert far is not None
+    for q_rad in (far[0] - 0.05, far[0] + 0.05, 0.0, far[1] - 0.05, far[1] + 0.05):
+        life.move(q_rad, 0.0)
+        # Of strategy 1 the effort that is asked for is the PWM.
+        for pwm in (0.3, -0.3, 0.0):
+            for k in range(3):
+                life.act(("acquire", k))
+                life.act(("aim", k, (None, None, pwm)))
+            life.move(q_rad, 0.0)
+            life.ticks(4)
+            outward = abs(q_rad) > far[1] and pwm * q_rad > 0.0
+            assert agents[0].wires.pwm[-1] == [0.0 if outward else pytest.approx(pwm, abs=0.1)] * 3
+            assert first_difference(agents) == "", (q_rad, pwm)
+
+
+@pytest.mark.parametrize("loop", range(3))
+def test_every_term_of_a_loop_is_the_same_in_both(loop: int) -> None:
+    """With errors of either sign, larger and smaller than the dead zone, and without a target."""
+    agents = [Agent(is_compiled, 3, "hold", 250.0) for is_compiled in (True, False)]
+    life = Life(agents, 8)
+    life.ticks(3)
+    terms: list[dict[str, Any]] = [
+        {"punch": 0.02},
+        {"punch": 0.02, "dead_zone": 0.2},
+        {"kd": 0.02, "d_on_error": True},
+        {"kd": 0.02, "d_on_error": False},
+        {"ki": 3.0, "i_clamp": 0.01},
+        {"target_lowpass": 0.3, "feed_forward": 1.0},
+        {"output_lowpass": 0.5},
+    ]
+    for changes in terms:
+        gains = tuple({"kp": 0.5, **changes} if k == loop else {} for k in range(3))
+        # The integral and what the last error was go with the target, and come with the next one.
+        for size in (0.4, -0.4, 0.05, None, 0.4):
+            aim = tuple(size if k == loop else None for k in range(3))
+            for k in range(3):
+                life.act(("acquire", k))
+                life.act(("gains", k, 3, gains))
+                life.act(("aim", k, aim))
+            life.ticks(6)
+        assert first_difference(agents) == "", changes
 
 
 def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
