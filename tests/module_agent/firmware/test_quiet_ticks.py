@@ -499,6 +499,33 @@ def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(at_li
             assert first_difference(agents) == "", (q_rad, aim_rad)
 
 
+@pytest.mark.parametrize("winding_c", [40.0, 152.0, 153.9])
+def test_what_heat_and_a_low_supply_leave_of_a_motor_is_the_same_in_both(winding_c: float) -> None:
+    """Also where a limit of speed, torque or position bounds it, too: a status names both."""
+    safety = (
+        Safety(velocity_rad_s=0.05),
+        Safety(effort_nm=0.1),
+        Safety(position_rad=(-0.2, 0.2), at_limit="hold"),
+    )
+    agents = [Agent(is_compiled, 3, "hold", 250.0, safety) for is_compiled in (True, False)]
+    life = Life(agents, 9)
+    life.ticks(3)
+    for k in range(3):
+        life.act(("hot", k, winding_c))
+    for voltage_v in (-24.0, 0.0, 0.5, 3.0, 24.0, 90.0):
+        for k in range(3):
+            life.act(("voltage", k, voltage_v))
+        for aim_rad in (0.5, -0.5):
+            life.move(0.15 * np.sign(aim_rad), 0.0)
+            for _ in range(4):
+                for k in range(3):
+                    life.act(("acquire", k))
+                    life.act(("aim", k, (aim_rad, None, 2.0 * np.sign(aim_rad))))
+                life.ticks(30)
+            assert first_difference(agents) == "", (voltage_v, aim_rad)
+    assert {module.firmware.state for module in agents[0].host.modules} <= {"armed", "streaming"}
+
+
 def test_beyond_its_types_own_range_a_motor_is_off_outwards_in_both() -> None:
     agents = [Agent(is_compiled, 1, "hold", 250.0, types=("SEA-snake",) * 3) for is_compiled in (True, False)]
     life = Life(agents, 7)
