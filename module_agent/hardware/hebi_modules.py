@@ -11,7 +11,8 @@ then keep strategy 0 until they are given another, which must be no side effect 
 Gains are written whenever a module begins to follow: another program may have had it meanwhile. A brake is a
 velocity of 0 under the factory's gains, since those of a holder may drive the motor. Before the driver falls
 silent it writes the gains that the modules came with, so that neither other programs nor the next agent take
-those of a holder for the owner's; an agent that is killed cannot do so.
+those of a holder for the owner's; an agent that is killed cannot do so, nor is it done to a module that has
+switched its motor off: it keeps HEBI's strategy 0, and gets its owner's gains after its next lease.
 """
 
 import math
@@ -171,10 +172,11 @@ class HebiModules:
         self._off_ticks = 0 if active else self._off_ticks + 1
         brakes = [index for index in due if commands[index].brake]
         begin = [index for index in due if index not in brakes]
+        # No target without the gains that it is for: when these are sent anew they bring it along.
+        without = [index for index in begin if self._links[index].given is None]
         is_confirmed = not begin or self._try_gains(begin)
         if not is_confirmed:
-            # No target without the gains that it is for: when these are sent anew they bring it along.
-            self._targets[begin] = math.nan
+            self._targets[without] = math.nan
         if brakes:
             self._try_brake_gains(brakes)
         # That the motors are off may be lost on the way: it is repeated until the modules' own lifetime ends.
@@ -296,7 +298,7 @@ class HebiModules:
             self._with_gains(indices), timeout_ms=_CONFIRM_MS
         )
         for link in links:
-            link.given = link.wanted if is_confirmed else None
+            link.given = link.wanted if is_confirmed else link.given
             link.tries = 0 if is_confirmed else link.tries + 1
         if max(link.tries for link in links) >= _CONFIRM_TRIES:
             names = ", ".join(link.serial for link in links)
@@ -317,7 +319,7 @@ class HebiModules:
         for index in indices:
             link = self._links[index]
             link.given, link.tries = (link.wanted if is_confirmed else None), 0
-            link.brake_tick = self._ticks + _BRAKE_AGAIN_TICKS
+            link.brake_tick = 0 if is_confirmed else self._ticks + _BRAKE_AGAIN_TICKS
 
     def _with_gains(self, indices: Sequence[int]) -> Any:
         """Return a command with the targets of the last one, and the gains that modules are to have."""

@@ -35,7 +35,7 @@ def compiled_with(*modules: ModuleType, inline: bool = False) -> Callable[[Funct
         index = _index(kernel)
         if index is not None:
             index._source_stamp = (index._source_stamp, *map(_stamp, modules))
-            _compare_first(index)
+            _compare_first(kernel)
         return cast(Function, kernel)
 
     return decorate
@@ -46,13 +46,15 @@ def _index(kernel: Any) -> Any:
     return getattr(getattr(kernel, "_cache", None), "_cache_file", None)
 
 
-def _compare_first(index: Any) -> None:
+def _compare_first(kernel: Any) -> None:
     """Let numba compare the stamp together with its version.
 
     It reads the index of an older file before it compares stamps, and fails where that names types of
     arguments that are gone.
     """
-    index._version = (numba.__version__, index._source_stamp)
+    index = _index(kernel)
+    if index is not None:
+        index._version = (numba.__version__, index._source_stamp)
 
 
 def _stamp(module: ModuleType) -> tuple[float, int]:
@@ -73,7 +75,7 @@ def inlined(function: Function) -> Function:
 def _kernel(function: Function, inline: bool = False) -> Function:
     try:
         kernel = numba.njit(cache=True, nogil=True, forceinline=inline)(function)
-        _compare_first(_index(kernel))
+        _compare_first(kernel)
     except RuntimeError:
         # No folder for the code (a read-only installation without a home): compiled in each process.
         kernel = numba.njit(nogil=True, forceinline=inline)(function)

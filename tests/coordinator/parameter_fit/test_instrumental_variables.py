@@ -132,6 +132,19 @@ def test_a_heavy_tool_that_the_prior_does_not_know_is_no_offset(seed: int, size:
     assert not found.terms.used.any()
 
 
+def test_an_offset_is_as_significant_where_a_tool_is_not_known(rng: Generator) -> None:
+    tool = PHI.reshape(JOINTS, -1).copy()
+    tool[-1, :4] += 4.0 * np.array([1.0, *(CHAIN.imu_home[-1, :3, 3] + 0.15 * CHAIN.axis[-1])])
+    q, torque = swings(rng, 4.0, tool.ravel())
+    torque[:, 1] += 0.15
+    seen = rows(filtered(q, torque + SIGMA_NM * rng.normal(size=torque.shape)))
+    known, unknown = (
+        solve_instrumental_variables(seen, phi, FRACTION).terms.gain[1, READING_TERMS.index("offset")]
+        for phi in (tool.ravel(), PHI)
+    )
+    assert unknown > max(SIGNIFICANT_F, 0.7 * known)
+
+
 def test_a_load_that_held_joints_do_not_tell_from_an_offset_is_none(rng: Generator) -> None:
     """It would be wrong in any other pose, with no uncertainty left."""
     tool = PHI.reshape(JOINTS, -1).copy()

@@ -402,8 +402,41 @@ def test_another_modules_brake_brings_no_target_without_its_gains(
     assert sent == [(50, 5.0), (5, pytest.approx(NAN, nan_ok=True))]
 
 
+def test_a_module_that_moves_keeps_its_target_while_the_answer_to_other_gains_is_lost(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would let go of its load otherwise."""
+    bench.driver.receive()
+    bench.driver.send([FORWARD, FORWARD])
+    bench.driver.set_gains(LAST, default_gains(module_type("X5-9"), 4))
+    targets: list[float] = []
+    for name in ("send_command", "send_command_with_acknowledgement"):
+        monkeypatch.setattr(
+            Group, name, lambda _, command, **__: targets.append(float(command.position[LAST])) and False
+        )
+    bench.driver.receive()
+    bench.driver.send([BRAKE, FORWARD])
+    assert targets == [5.0, 5.0]
+
+
+def test_a_second_stop_brakes_at_once_under_the_factorys_gains(leased: Leased) -> None:
+    """Also where the lease was acquired anew just before."""
+    assert leased.acquire().accepted
+    assert leased.give_gains(4).accepted
+    for _ in range(2):
+        assert leased.ask(Leaf.STOP, Stop, why="for the test").accepted
+        leased.run(1)
+        assert leased.driver._links[LAST].given is leased.driver._links[LAST].brake_gains
+        assert leased.acquire().accepted
+        leased.run(1)
+        assert leased.module.gains.strategy == 4
+
+
+@pytest.mark.parametrize("ends", ["at once", "later"])
 @pytest.mark.parametrize("before", ["gains of its holder", "a stop"])
-def test_no_gains_are_handed_back_to_a_module_that_is_off_at_its_m_stop(leased: Leased, before: str) -> None:
+def test_no_gains_are_handed_back_to_a_module_that_is_off_at_its_m_stop(
+    leased: Leased, before: str, ends: str
+) -> None:
     """With gains comes a strategy, under which it would follow again."""
     own = default_gains(leased.module._kind, 4)
     leased.module._loops.set_gains(0, own)
@@ -418,13 +451,14 @@ def test_no_gains_are_handed_back_to_a_module_that_is_off_at_its_m_stop(leased: 
     leased.module.m_stop = True
     leased.run(2)
     leased.strategies.clear()
-    # Its lease expires, and what HEBI's module follows; the button is released; the agent ends.
-    leased.run(300)
-    leased.module.m_stop = False
-    leased.run(50)
+    if ends == "later":
+        # Its lease expires, and what HEBI's module follows; the button is released; the agent ends.
+        leased.run(300)
+        leased.module.m_stop = False
+        leased.run(50)
     leased.driver.close()
     leased.pass_ticks(2)
-    assert leased.strategies == {0}
+    assert leased.strategies <= {0}
     assert leased.module.gains.strategy == 0
 
 

@@ -29,12 +29,14 @@ print(total({name}(np.ones(3))))
 def test_code_that_was_kept_for_types_that_are_gone_is_compiled_anew(tmp_path: Path) -> None:
     """As after an update of the files in place."""
     module = tmp_path / "kernel.py"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
     for name, factor, expected in (("Before", 1.0, "3.0"), ("After", 2.0, "6.0"), ("After", 2.0, "6.0")):
         module.write_text(KERNEL.format(name=name, factor=factor))
         done = subprocess.run(
             [sys.executable, "-c", "import kernel"],
             cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            env=environment,
             capture_output=True,
             text=True,
             check=False,
