@@ -173,7 +173,7 @@ class HebiModules:
         brakes = [index for index in due if commands[index].brake]
         begin = [index for index in due if index not in brakes]
         # No target without the gains that it is for: when these are sent anew they bring it along.
-        without = [index for index in begin if self._links[index].given is None]
+        without = [index for index in begin if self._links[index].awaits_gains]
         is_confirmed = not begin or self._try_gains(begin)
         if not is_confirmed:
             self._targets[without] = math.nan
@@ -281,7 +281,7 @@ class HebiModules:
         if begins or link.is_withheld or not self._may_follow:
             link.given = None
         if begins:
-            link.tries = 0
+            link.tries, link.awaits_gains = 0, True
         if not link.follows and link.given is None:
             return False
         link.wanted = link.brake_gains if command.brake else self._information[index].gains
@@ -298,8 +298,10 @@ class HebiModules:
             self._with_gains(indices), timeout_ms=_CONFIRM_MS
         )
         for link in links:
-            link.given = link.wanted if is_confirmed else link.given
+            # Those that are not confirmed may have arrived.
+            link.given = link.wanted if is_confirmed else None
             link.tries = 0 if is_confirmed else link.tries + 1
+            link.awaits_gains &= not is_confirmed
         if max(link.tries for link in links) >= _CONFIRM_TRIES:
             names = ", ".join(link.serial for link in links)
             raise HardwareLost(
@@ -381,6 +383,7 @@ class _Link:
     targets nor gains until it is to follow a target. m_stop_latches: the M-stop leaves its motor off.
     follows: its last target was one. given: the gains that were written last, None where another program may
     have written others since; wanted: those that are to be. tries: how often these were not confirmed.
+    awaits_gains: whether none were confirmed since it began to follow.
     brake_tick: when those to brake with are due. is_lent: whether others than those that it came with were
     sent since these were handed back, confirmed or not.
     """
@@ -398,6 +401,7 @@ class _Link:
         self.given: GainSet | None = None
         self.wanted = information.gains
         self.tries = 0
+        self.awaits_gains = False
         self.is_lent = False
         self.brake_tick = 0
         self.brake_gains = default_gains(module_type(information.module_type), DEFAULT_STRATEGY)

@@ -432,6 +432,23 @@ def test_a_second_stop_brakes_at_once_under_the_factorys_gains(leased: Leased) -
         assert leased.module.gains.strategy == 4
 
 
+def test_a_stop_brakes_under_the_factorys_gains_where_the_answer_to_others_was_lost(
+    leased: Leased, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """These have arrived all the same."""
+    assert leased.acquire().accepted
+    assert leased.give_gains(4).accepted
+    assert leased.ask(Leaf.STOP, Stop, why="for the test").accepted
+    leased.run(1)
+    with monkeypatch.context() as patch:
+        losing_answers(patch, 1)
+        assert leased.acquire().accepted
+    assert leased.module.gains.strategy == 4
+    assert leased.ask(Leaf.STOP, Stop, why="for the test").accepted
+    leased.run(1)
+    assert leased.module.gains.strategy == leased.driver._links[LAST].brake_gains.strategy == 3
+
+
 @pytest.mark.parametrize("ends", ["at once", "later"])
 @pytest.mark.parametrize("before", ["gains of its holder", "a stop"])
 def test_no_gains_are_handed_back_to_a_module_that_is_off_at_its_m_stop(
