@@ -560,6 +560,10 @@ def test_every_term_of_a_loop_is_the_same_in_both(loop: int) -> None:
         {"ki": 3.0, "i_clamp": 0.01},
         {"target_lowpass": 0.3, "feed_forward": 1.0},
         {"output_lowpass": 0.5},
+        # The aims below are beyond these, and 5 times the error is more than a loop may ask for.
+        {"min_target": -0.2, "max_target": 0.1},
+        {"kp": 5.0, "min_output": -0.1, "max_output": 0.2},
+        {"kp": 5.0, "output_lowpass": 0.5},
     ]
     for changes in terms:
         gains = tuple({"kp": 0.5, **changes} if k == loop else {} for k in range(3))
@@ -572,6 +576,27 @@ def test_every_term_of_a_loop_is_the_same_in_both(loop: int) -> None:
                 life.act(("aim", k, aim))
             life.ticks(6)
         assert first_difference(agents) == "", changes
+
+
+@pytest.mark.parametrize("strategy", [1, 3])
+def test_loops_that_ask_for_more_than_the_whole_supply_get_all_of_it_in_both(strategy: int) -> None:
+    """Two loops may ask for 1 each, and an effort of strategy 1 is a PWM; 90 V leave room for more than 1."""
+    safety = (Safety(velocity_rad_s=1e3, current_a=1e3, effort_nm=1e3),) * 3
+    agents = [Agent(is_compiled, strategy, "hold", 250.0, safety) for is_compiled in (True, False)]
+    life = Life(agents, 10)
+    life.ticks(3)
+    stiff = {"kp": 5.0, "min_output": -1.0, "max_output": 1.0}
+    for k in range(3):
+        life.act(("acquire", k))
+        life.act(("voltage", k, 90.0))
+        life.act(("gains", k, strategy, (stiff, stiff, stiff)))
+    for sign in (1.0, -1.0):
+        for k in range(3):
+            life.act(("acquire", k))
+            life.act(("aim", k, (4.0 * sign, 4.0 * sign, 4.0 * sign)))
+        life.ticks(4)
+        assert agents[0].wires.pwm[-1] == [sign] * 3
+        assert first_difference(agents) == "", sign
 
 
 def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
