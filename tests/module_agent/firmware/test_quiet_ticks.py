@@ -1,5 +1,6 @@
 """Quiet ticks in machine code and ticks of the Python objects are the same ticks, to the bit."""
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -211,7 +212,9 @@ ACTIONS = st.one_of(
     st.tuples(
         st.just("sick"),
         st.integers(0, 2),
-        st.sampled_from(["velocity_rad_s", "effort_nm", "accel_x_m_s2", "winding_temperature_c"]),
+        st.sampled_from(
+            ["position_rad", "velocity_rad_s", "effort_nm", "accel_x_m_s2", "winding_temperature_c"]
+        ),
         st.sampled_from([float("nan"), float("inf"), 1e7]),
         st.integers(1, 9),
     ),
@@ -473,8 +476,11 @@ def test_a_motion_that_is_stopped_expires_or_overheats_is_the_same_in_both(expir
     assert first_difference(agents) == ""
 
 
+@pytest.mark.parametrize("voltage_v", [24.0, 90.0])
 @pytest.mark.parametrize("at_limit", ["hold", "spring", "motor_off"])
-def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(at_limit: Any) -> None:
+def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(
+    at_limit: Any, voltage_v: float
+) -> None:
     """The speed that a limit allows falls with the distance, first by braking, then in proportion to it."""
     safety = (
         Safety(position_rad=(-0.5, 0.5), at_limit=at_limit),
@@ -488,15 +494,90 @@ def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(at_li
     for k in range(3):
         life.act(("acquire", k))
         life.act(("gains", k, 3, (stiff, {}, {})))
+        # With such a supply a PWM of more than 1, which a limit may ask for, would be one of 1 at the least.
+        life.act(("voltage", k, voltage_v))
     for q_rad in (-0.52, -0.49, -0.45, -0.3, -0.1, 0.1, 0.3, 0.45, 0.49, 0.52):
         for aim_rad in (q_rad - 0.4, q_rad + 0.4):
             for k in range(3):
                 life.act(("acquire", k))
                 life.act(("aim", k, (aim_rad, None, None)))
-            for share in np.linspace(-0.5, 0.5, 21).tolist():
+            for share in (-1.5, *np.linspace(-0.5, 0.5, 21).tolist(), 1.5):
                 life.move(q_rad, share)
                 life.ticks(1)
             assert first_difference(agents) == "", (q_rad, aim_rad)
+
+
+@pytest.mark.parametrize("at_limit", ["hold", "spring"])
+def test_a_motor_that_brakes_is_bounded_alike(at_limit: Any) -> None:
+    """It brakes less where that would exceed a torque or the supply, and never drives for a limit's sake."""
+    safety = (
+        Safety(position_rad=(-0.5, 0.5), at_limit=at_limit),
+        Safety(effort_nm=0.2, velocity_rad_s=0.1),
+        Safety(position_rad=(-0.5, 0.5), at_limit=at_limit, effort_nm=0.1, current_a=0.1),
+    )
+    agents = [Agent(is_compiled, 3, "damping", 250.0, safety) for is_compiled in (True, False)]
+    life = Life(agents, 11)
+    life.ticks(3)
+    for voltage_v in (24.0, 1.0):
+        for k in range(3):
+            life.act(("voltage", k, voltage_v))
+        for q_rad in (-0.6, -0.52, -0.48, 0.0, 0.48, 0.52, 0.6):
+            for k in range(3):
+                life.act(("stop", k))
+            for share in (-1.5, *np.linspace(-0.5, 0.5, 21).tolist(), 1.5):
+                life.move(q_rad, share)
+                life.ticks(2)
+            assert first_difference(agents) == "", (voltage_v, q_rad)
+    assert all(module.firmware.state in ("stopped", "idle") for module in agents[0].host.modules)
+
+
+@pytest.mark.parametrize("strategy", range(5))
+def test_every_choice_of_targets_is_followed_alike(strategy: int) -> None:
+    agents = [Agent(is_compiled, strategy, "hold", 250.0) for is_compiled in (True, False)]
+    life = Life(agents, 12)
+    life.ticks(3)
+    for chosen in itertools.product((None, 0.1), (None, 0.3), (None, -0.2)):
+        for k in range(3):
+            life.act(("acquire", k))
+            life.act(("aim", k, chosen))
+        life.ticks(6)
+        assert first_difference(agents) == "", chosen
+
+
+@pytest.mark.parametrize("sensor", [name for name in SensorSample._fields if not name.endswith("_ns")])
+def test_a_bad_reading_of_any_sensor_is_found_in_the_same_tick_by_both(sensor: str) -> None:
+    """A single one is held over, and several are a fault."""
+    agents = [Agent(is_compiled, 3, "hold", 250.0) for is_compiled in (True, False)]
+    life = Life(agents, 13)
+    life.ticks(3)
+    for count in (1, 30):
+        for k in range(3):
+            life.act(("acquire", k))
+            life.act(("aim", k, (0.1, None, None)))
+        life.ticks(5)
+        for k in range(3):
+            life.act(("sick", k, sensor, float("nan"), count))
+        life.ticks(5)
+        states = {module.firmware.state for module in agents[0].host.modules}
+        assert states == ({"streaming"} if count == 1 else {"fault"})
+        life.ticks(40)
+        assert first_difference(agents) == "", count
+
+
+@pytest.mark.parametrize("jump_ms", [3, 15, 25, 35, 130])
+def test_a_jump_of_a_clock_ends_commands_in_the_same_tick_in_both(jump_ms: int) -> None:
+    """More than half a lifetime at once does, even if the command is younger than a lifetime then."""
+    agents = [Agent(is_compiled, 3, "hold", 250.0) for is_compiled in (True, False)]
+    life = Life(agents, 14)
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+        life.act(("aim", k, (0.1, None, None)))
+        life.act(("clock", k, jump_ms))
+        state = agents[0].host.modules[k].firmware.state
+        assert state == ("streaming" if jump_ms < 20 else "expired")
+    life.ticks(10)
+    assert first_difference(agents) == ""
 
 
 @pytest.mark.parametrize("winding_c", [40.0, 152.0, 153.9])
@@ -599,11 +680,9 @@ def test_loops_that_ask_for_more_than_the_whole_supply_get_all_of_it_in_both(str
         assert first_difference(agents) == "", sign
 
 
-def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An idle module needs its Python objects for its statuses, and for nothing else."""
-    agent = Agent(True, 3, "hold", 250.0)
-    life = Life([agent], 1)
-    life.ticks(3)
+@pytest.fixture
+def python_ticks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A list that grows by a module's number for every tick that its Python objects run."""
     taken: list[int] = []
     take = LoopInside.take
 
@@ -612,9 +691,50 @@ def test_most_ticks_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
         return take(self, index, read)
 
     monkeypatch.setattr(LoopInside, "take", counted)
+    return taken
+
+
+def test_most_ticks_are_quiet(python_ticks: list[int]) -> None:
+    """An idle module needs its Python objects for its statuses, and for nothing else."""
+    agent = Agent(True, 3, "hold", 250.0)
+    life = Life([agent], 1)
+    life.ticks(3)
+    python_ticks.clear()
     life.ticks(2100)
     # Idle, a module has a status every 400 ms.
-    assert len(taken) == 3 * 5
+    assert len(python_ticks) == 3 * 5
+
+
+@pytest.mark.parametrize("at_limit", ["hold", "spring", "motor_off"])
+def test_most_ticks_of_a_motion_within_limits_are_quiet(at_limit: Any, python_ticks: list[int]) -> None:
+    """Between two statuses nothing of it needs Python's objects."""
+    safety = Safety(position_rad=(-3.0, 3.0), at_limit=at_limit)
+    agent = Agent(True, 3, "hold", 250.0, (safety,) * 3)
+    life = Life([agent], 15)
+    life.ticks(3)
+    for k in range(3):
+        life.act(("acquire", k))
+        life.act(("motion", k, SWING))
+    life.ticks(3)
+    python_ticks.clear()
+    life.ticks(30)
+    assert {module.firmware.state for module in agent.host.modules} == {"moving"}
+    assert python_ticks == []
+
+
+def test_a_tick_says_how_many_modules_need_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of ticks of a bus ends with the first in which some do."""
+    counts: list[tuple[int, int]] = []
+    tick = tick_kernel.tick
+
+    def counted(*arguments: Any) -> None:
+        others, results = tick(*arguments), arguments[-1]
+        counts.append((others, int(np.count_nonzero(results == tick_kernel.NOT_QUIET))))
+
+    monkeypatch.setattr(tick_kernel, "tick", counted)
+    live([Agent(True, 3, "hold", 250.0)], 3, STEPS)
+    assert {told for told, _ in counts} == {0, 1, 2, 3}
+    assert all(told == found for told, found in counts)
 
 
 def test_the_kernels_constants_are_those_of_the_objects() -> None:
