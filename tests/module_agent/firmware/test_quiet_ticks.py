@@ -254,8 +254,8 @@ LIMITS = st.one_of(
 class Life:
     """The same random life of two agents."""
 
-    def __init__(self, agents: Sequence[Agent], seed: int):
-        self._agents = agents
+    def __init__(self, agents: Sequence[Agent], seed: int, jitter_ns: int = 20):
+        self._agents, self._jitter_ns = agents, jitter_ns
         self._rng = np.random.default_rng(seed)
         self._now = [10**12 + 17 * k for k in range(3)]
         self._imu = [0, 0, 0]
@@ -284,7 +284,8 @@ class Life:
                 agent.tick(samples)
 
     def _sample(self, k: int) -> SensorSample:
-        self._now[k] += int(self._rate[k] * (MS + int(self._rng.integers(-20, 20))))
+        jitter_ns = int(self._rng.integers(-self._jitter_ns, self._jitter_ns)) if self._jitter_ns else 0
+        self._now[k] += int(self._rate[k] * (MS + jitter_ns))
         if self._tick % 4 == k:
             self._imu[k] = self._now[k]
         random = self._rng.normal(0.0, 0.3, 12).tolist()
@@ -476,6 +477,20 @@ def test_a_motion_that_is_stopped_expires_or_overheats_is_the_same_in_both(expir
     assert first_difference(agents) == ""
 
 
+@pytest.mark.parametrize("expiry", ["motor_off", "hold", "damping"])
+@pytest.mark.parametrize("steps", [STEPS, SLOW_CLOCKS, HOT_SWING], ids=["all", "slow clocks", "heat"])
+def test_a_time_that_is_met_to_the_nanosecond_is_over_in_both(
+    steps: Sequence[tuple[Any, ...]], expiry: str
+) -> None:
+    """Of clocks without jitter lifetimes, motions and leases end just when a tick begins."""
+    agents = [Agent(is_compiled, 3, expiry, 250.0) for is_compiled in (True, False)]
+    life = Life(agents, 16, jitter_ns=0)
+    life.ticks(3)
+    for action in (*(("acquire", k) for k in range(3)), *steps, ("ticks", 300)):
+        life.act(action)
+    assert first_difference(agents) == ""
+
+
 @pytest.mark.parametrize("voltage_v", [24.0, 90.0])
 @pytest.mark.parametrize("at_limit", ["hold", "spring", "motor_off"])
 def test_a_motor_is_bounded_alike_at_every_speed_and_distance_from_a_limit(
@@ -585,7 +600,7 @@ def test_what_heat_and_a_low_supply_leave_of_a_motor_is_the_same_in_both(winding
     """Also where a limit of speed, torque or position bounds it, too: a status names both."""
     safety = (
         Safety(velocity_rad_s=0.05),
-        Safety(effort_nm=0.1),
+        Safety(velocity_rad_s=0.05, effort_nm=0.1),
         Safety(position_rad=(-0.2, 0.2), at_limit="hold"),
     )
     agents = [Agent(is_compiled, 3, "hold", 250.0, safety) for is_compiled in (True, False)]
@@ -661,20 +676,20 @@ def test_every_term_of_a_loop_is_the_same_in_both(loop: int) -> None:
 
 @pytest.mark.parametrize("strategy", [1, 3])
 def test_loops_that_ask_for_more_than_the_whole_supply_get_all_of_it_in_both(strategy: int) -> None:
-    """Two loops may ask for 1 each, and an effort of strategy 1 is a PWM; 90 V leave room for more than 1."""
+    """Several loops may ask for 1.5 together, as may an effort of strategy 1; of 90 V that would be there."""
     safety = (Safety(velocity_rad_s=1e3, current_a=1e3, effort_nm=1e3),) * 3
     agents = [Agent(is_compiled, strategy, "hold", 250.0, safety) for is_compiled in (True, False)]
     life = Life(agents, 10)
     life.ticks(3)
-    stiff = {"kp": 5.0, "min_output": -1.0, "max_output": 1.0}
+    loops = tuple({"kp": 5.0, "min_output": -most, "max_output": most} for most in (1.0, 0.25, 0.25))
     for k in range(3):
         life.act(("acquire", k))
         life.act(("voltage", k, 90.0))
-        life.act(("gains", k, strategy, (stiff, stiff, stiff)))
+        life.act(("gains", k, strategy, loops))
     for sign in (1.0, -1.0):
         for k in range(3):
             life.act(("acquire", k))
-            life.act(("aim", k, (4.0 * sign, 4.0 * sign, 4.0 * sign)))
+            life.act(("aim", k, (4.0 * sign, 4.0 * sign, 1.5 * sign)))
         life.ticks(4)
         assert agents[0].wires.pwm[-1] == [sign] * 3
         assert first_difference(agents) == "", sign
