@@ -120,7 +120,9 @@ class Agent:
     ):
         self.types = types
         self.wires, self.network = Scripted(types), Network()
-        loops = LoopInside(self.wires, dict(zip(SERIALS, safety, strict=True)))
+        self.loops = loops = LoopInside(self.wires, dict(zip(SERIALS, safety, strict=True)))
+        # What limits the motors' PWM, tick by tick: a status tells all that did since the last.
+        self.limits: list[list[int]] = []
         modules: Any = loops if is_compiled else Plain(loops)
         configs = [
             config_of(
@@ -138,6 +140,11 @@ class Agent:
     def tick(self, samples: list[SensorSample]) -> None:
         self.wires.samples = samples
         self.host.cycle()
+        quiet = self.host._quiet
+        if quiet is None:
+            self.limits.append([int(self.loops.quiet_state(k).limit) for k in range(3)])
+        else:
+            self.limits.append(quiet._integers[:, tick_kernel.LIMIT].tolist())
 
     @property
     def everything(self) -> tuple[Any, ...]:
@@ -158,7 +165,9 @@ def first_difference(agents: Sequence[Agent]) -> str:
     compare it whole, line by line, would take a failing test minutes.
     """
     for name, *both in zip(
-        ("PWM", "messages", "states", "rows"), *(a.everything for a in agents), strict=True
+        ("PWM", "messages", "states", "rows", "limits"),
+        *((*agent.everything, agent.limits) for agent in agents),
+        strict=True,
     ):
         one, other = map(repr, both)
         if one != other:
@@ -486,7 +495,8 @@ def test_a_time_that_is_met_to_the_nanosecond_is_over_in_both(
     agents = [Agent(is_compiled, 3, expiry, 250.0) for is_compiled in (True, False)]
     life = Life(agents, 16, jitter_ns=0)
     life.ticks(3)
-    for action in (*(("acquire", k) for k in range(3)), *steps, ("ticks", 300)):
+    rest = (("acquire", 0), ("motion", 0, Rest(duration_s=0.02)), ("ticks", 60))
+    for action in (*(("acquire", k) for k in range(3)), *steps, *rest, ("ticks", 300)):
         life.act(action)
     assert first_difference(agents) == ""
 
