@@ -664,6 +664,10 @@ def test_every_term_of_a_loop_is_the_same_in_both(loop: int) -> None:
         {"kd": 0.02, "d_on_error": True},
         {"kd": 0.02, "d_on_error": False},
         {"ki": 3.0, "i_clamp": 0.01},
+        # Zero is the gain of a term that is left out, and no other number is.
+        {"punch": 1.0},
+        {"kd": 1.0},
+        {"ki": 1.0},
         {"target_lowpass": 0.3, "feed_forward": 1.0},
         {"output_lowpass": 0.5},
         # The aims below are beyond these, and 5 times the error is more than a loop may ask for.
