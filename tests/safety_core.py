@@ -4,6 +4,7 @@
 
     python -m tests.safety_core coverage
     python -m tests.safety_core mutants [--report]
+    python -m tests.safety_core kernel [--report]
 
 A mutant that the tests do not notice is a survivor. It must be explained in `module_agent/survivors.toml`, by
 its function and by the lines that it changes. Two kinds need no entry: one that changes words of a message
@@ -14,10 +15,17 @@ not decided; an entry that no survivor needs any more is named.
 A mutant under which the tests do not end is noticed by that: a run of them that hangs is no run that passes.
 The limit, 15 times what they take and 15 s more, may be too short on a busy machine, so that each such mutant
 is run a second time when all others are done, and counts if it hangs again.
+
+Most ticks are decided by a compiled copy of the core, `KERNEL`. mutmut makes the same changes of it, but
+cannot run them: a kernel calls no function that is exchanged at run time. `kernel` compiles each changed copy
+anew, in a process of its own, and looks whether the tests that compare it with the core notice.
 """
 
+import contextlib
+import difflib
 import io
 import json
+import multiprocessing
 import os
 import re
 import subprocess
@@ -31,6 +39,9 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).parents[1]
 SURVIVORS = Path(__file__).parent / "module_agent" / "survivors.toml"
 KILLED, SURVIVED, NOT_CHECKED, HANGS = "killed", "survived", "not checked", "timeout"
+KERNEL = "module_agent/firmware/tick_kernel.py"
+KERNEL_TESTS = "tests/module_agent/firmware/test_quiet_ticks.py"
+KERNEL_RESULTS = ROOT / "mutants" / "tick_kernel.json"
 
 
 class Mutant(NamedTuple):
@@ -168,14 +179,117 @@ def mutants(run: bool) -> int:
         print(f"{waiting} are not checked: run it again, it goes on where it has stopped")
     for name, one in open_ones.items():
         print(f"\n{decided[name]}, not explained: {name}\n  {one.where}\n- {one.was}\n+ {one.becomes}")
-    for one in () if waiting else reasons.keys() - set(survivors.values()):
-        print(f"explained, and no survivor any more: {one.where}: {one.was!r} -> {one.becomes!r}")
+    if not waiting:
+        print_needless({one for one in reasons if not is_of_kernel(one)} - set(survivors.values()))
     return 1 if open_ones or waiting or not decided else 0
 
 
+def print_needless(reasons: set[Mutant]) -> None:
+    """Name the explanations of mutants that are noticed by now."""
+    for one in reasons:
+        print(f"explained, and no survivor any more: {one.where}: {one.was!r} -> {one.becomes!r}")
+
+
+# ------------------------------------------------------------------ the compiled copy
+
+
+def is_of_kernel(one: Mutant) -> bool:
+    """Return whether a mutant is one of the compiled tick."""
+    return one.where.rpartition(".")[0] == _module(KERNEL)
+
+
+def _module(file: str) -> str:
+    return file.removesuffix(".py").replace("/", ".")
+
+
+def kernel_mutants() -> list[tuple[Mutant, str]]:
+    """Return all mutants of the compiled tick, each with the source of its file."""
+    from mutmut.mutation.file_mutation import create_mutations, deep_replace
+
+    # It passes decorated functions by.
+    plain = (ROOT / KERNEL).read_text().replace("@compiled\n", "")
+    tree, mutations, *_ = create_mutations(KERNEL, plain)
+    found = []
+    for mutation in mutations:
+        function = mutation.contained_by_top_level_function
+        if function is None:
+            continue
+        changed: Any = deep_replace(function, mutation.original_node, mutation.mutated_node)
+        before, after = tree.code_for_node(function), tree.code_for_node(changed)
+        lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), "", "", n=0))[3:]
+        was, becomes = (
+            "\n".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in ("-", "+")
+        )
+        source = re.sub("^def ", "@compiled\ndef ", plain.replace(before, after), flags=re.MULTILINE)
+        found.append((Mutant(f"{_module(KERNEL)}.{function.name.value}", was, becomes), source))
+    return found
+
+
+def is_noticed(source: str) -> bool:
+    """Return whether the tests of the compiled tick fail on this source of it; spoils it for this process."""
+    import pytest
+    from hypothesis import Phase, settings
+
+    from module_agent.firmware import tick_kernel
+
+    settings.register_profile(
+        "kernel", phases=[Phase.generate], report_multiple_bugs=False, derandomize=True, database=None
+    )
+    settings.load_profile("kernel")
+    options = ["-x", "-q", "-o", "addopts=", "--import-mode=importlib", "-p", "no:cacheprovider"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        # Where a source has no file, its machine code is not taken from what is kept on disk.
+        exec(compile(source, "<mutant>", "exec"), vars(tick_kernel))
+        code = pytest.main([*options, str(ROOT / KERNEL_TESTS)])
+    if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+        raise RuntimeError(f"pytest ended with {code!r}:\n{said.getvalue()}")
+    return code == pytest.ExitCode.TESTS_FAILED
+
+
+def _decided(mutant: tuple[Mutant, str]) -> tuple[Mutant, bool]:
+    return mutant[0], is_noticed(mutant[1])
+
+
+def run_kernel_mutants() -> None:
+    """Run all mutants of the compiled tick, and keep those that are not noticed."""
+    mutants, survivors = kernel_mutants(), []
+    # In a process of its own each: what it has changed is not changed back.
+    with multiprocessing.get_context("fork").Pool(maxtasksperchild=1) as pool:
+        for count, (one, noticed) in enumerate(pool.imap_unordered(_decided, mutants), 1):
+            survivors += [] if noticed else [one]
+            print(f"\r{count} of {len(mutants)}, {len(survivors)} not noticed", end="", flush=True)
+    print()
+    KERNEL_RESULTS.parent.mkdir(exist_ok=True)
+    KERNEL_RESULTS.write_text(json.dumps({"mutants": len(mutants), "survivors": survivors}))
+
+
+def kernel(run: bool) -> int:
+    """Run all mutants of the compiled tick and print what became of them; return 0 if all are explained."""
+    if run:
+        run_kernel_mutants()
+    decided = json.loads(KERNEL_RESULTS.read_text())
+    survivors = [Mutant(*one) for one in decided["survivors"]]
+    reasons = {one: why for one, why in explained().items() if is_of_kernel(one)}
+    open_ones = [one for one in survivors if one not in reasons]
+    noticed, known = decided["mutants"] - len(survivors), len(survivors) - len(open_ones)
+    print(
+        f"{decided['mutants']} mutants of {KERNEL}: {noticed} noticed, {known} explained in "
+        f"{SURVIVORS.relative_to(ROOT)}, {len(open_ones)} neither"
+    )
+    for one in open_ones:
+        print(f"\nnot explained: {one.where}\n- {one.was}\n+ {one.becomes}")
+    print_needless(reasons.keys() - set(survivors))
+    return 1 if open_ones else 0
+
+
 def main(arguments: list[str]) -> int:
-    """Run one of the two commands."""
-    commands: dict[str, Any] = {"coverage": coverage, "mutants": lambda: mutants("--report" not in arguments)}
+    """Run one of the commands."""
+    run = "--report" not in arguments
+    commands: dict[str, Any] = {
+        "coverage": coverage,
+        "mutants": lambda: mutants(run),
+        "kernel": lambda: kernel(run),
+    }
     if not arguments or arguments[0] not in commands:
         print(__doc__)
         return 2

@@ -1,10 +1,20 @@
 """The list of explained survivors is one of changes to the safety core, and words alone need no entry."""
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
 
-from tests.safety_core import Mutant, changes_words_only, core, explained, makes_zip_loose
+from tests.safety_core import (
+    KERNEL,
+    Mutant,
+    changes_words_only,
+    core,
+    explained,
+    is_noticed,
+    kernel_mutants,
+    makes_zip_loose,
+)
 
 ROOT = Path(__file__).parents[1]
 
@@ -16,7 +26,8 @@ def test_core_and_tests_are_files_of_the_project() -> None:
 
 def test_every_explained_survivor_changes_a_line_that_is_there() -> None:
     """An entry for code that is gone would hide nothing, and mislead."""
-    modules = {path.removesuffix(".py").replace("/", "."): (ROOT / path).read_text() for path in core().files}
+    files = (*core().files, KERNEL)
+    modules = {path.removesuffix(".py").replace("/", "."): (ROOT / path).read_text() for path in files}
     for one, why in explained().items():
         (module,) = [name for name in modules if one.where.startswith(f"{name}.")]
         lines = [line.strip() for line in modules[module].splitlines()]
@@ -57,3 +68,17 @@ def test_a_zip_that_is_loose_is_one_that_lost_its_strictness_and_nothing_else(
     becomes: str, loose: bool
 ) -> None:
     assert makes_zip_loose(Mutant("a.b", "for a, b in zip(f(x), y, strict=True):", becomes)) is loose
+
+
+def test_a_wrong_compiled_tick_is_noticed_and_the_right_one_is_not() -> None:
+    """Each is compiled in a process of its own, beside the machine code that is kept."""
+    mutants = dict(kernel_mutants())
+    (wrong,) = (
+        source
+        for one, source in mutants.items()
+        if (one.was, one.becomes) == ("if bad == 0:", "if bad != 0:") or "return bad != 0" in one.becomes
+    )
+    right = (ROOT / KERNEL).read_text()
+    with multiprocessing.get_context("spawn").Pool(maxtasksperchild=1) as pool:
+        assert pool.map(is_noticed, [right, wrong], chunksize=1) == [False, True]
+    assert len(mutants) > 500
