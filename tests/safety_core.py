@@ -33,6 +33,7 @@ import sys
 import tokenize
 import tomllib
 from collections import Counter
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +43,8 @@ KILLED, SURVIVED, NOT_CHECKED, HANGS = "killed", "survived", "not checked", "tim
 KERNEL = "module_agent/firmware/tick_kernel.py"
 KERNEL_TESTS = "tests/module_agent/firmware/test_quiet_ticks.py"
 KERNEL_RESULTS = ROOT / "mutants" / "tick_kernel.json"
+# What a process says by its exit code.
+NOTICED = 3
 
 
 class Mutant(NamedTuple):
@@ -236,7 +239,17 @@ def is_noticed(source: str) -> bool:
         "kernel", phases=[Phase.generate], report_multiple_bugs=False, derandomize=True, database=None
     )
     settings.load_profile("kernel")
-    options = ["-x", "-q", "-o", "addopts=", "--import-mode=importlib", "-p", "no:cacheprovider"]
+    options = [
+        "-x",
+        "-q",
+        "-o",
+        "addopts=",
+        "--import-mode=importlib",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:faulthandler",
+    ]
     with contextlib.redirect_stdout(io.StringIO()) as said:
         # Where a source has no file, its machine code is not taken from what is kept on disk.
         exec(compile(source, "<mutant>", "exec"), vars(tick_kernel))
@@ -246,40 +259,61 @@ def is_noticed(source: str) -> bool:
     return code == pytest.ExitCode.TESTS_FAILED
 
 
-def _decided(mutant: tuple[Mutant, str]) -> tuple[Mutant, bool]:
-    return mutant[0], is_noticed(mutant[1])
+def _end_by_tests(source: str) -> None:
+    sys.exit(NOTICED if is_noticed(source) else 0)
 
 
 def run_kernel_mutants() -> None:
-    """Run all mutants of the compiled tick, and keep those that are not noticed."""
-    mutants, survivors = kernel_mutants(), []
-    # In a process of its own each: what it has changed is not changed back.
-    with multiprocessing.get_context("fork").Pool(maxtasksperchild=1) as pool:
-        for count, (one, noticed) in enumerate(pool.imap_unordered(_decided, mutants), 1):
-            survivors += [] if noticed else [one]
-            print(f"\r{count} of {len(mutants)}, {len(survivors)} not noticed", end="", flush=True)
+    """Run all mutants of the compiled tick that are not decided, and keep what becomes of them."""
+    decided = kernel_results()
+    waiting = [(one, source) for one, source in kernel_mutants() if one not in decided]
+    running: dict[int, tuple[Any, Mutant]] = {}
+    while waiting or running:
+        while waiting and len(running) < (os.cpu_count() or 1):
+            one, source = waiting.pop()
+            # A process of its own: what it has changed is not changed back.
+            process = multiprocessing.get_context("fork").Process(target=_end_by_tests, args=(source,))
+            process.start()
+            running[process.sentinel] = process, one
+        for sentinel in wait(list(running)):
+            process, one = running.pop(sentinel)  # type: ignore[index]
+            process.join()
+            if process.exitcode not in (0, NOTICED) and process.exitcode >= 0:
+                raise RuntimeError(f"the tests of {one} ended with {process.exitcode}")
+            # One that writes beyond its arrays may end its process: that is noticed, too.
+            decided[one] = SURVIVED if process.exitcode == 0 else KILLED
+        KERNEL_RESULTS.parent.mkdir(exist_ok=True)
+        KERNEL_RESULTS.write_text(json.dumps([[*one, status] for one, status in decided.items()]))
+        alive = sum(status == SURVIVED for status in decided.values())
+        print(f"\r{len(decided)} decided, {len(waiting)} wait, {alive} not noticed", end="", flush=True)
     print()
-    KERNEL_RESULTS.parent.mkdir(exist_ok=True)
-    KERNEL_RESULTS.write_text(json.dumps({"mutants": len(mutants), "survivors": survivors}))
+
+
+def kernel_results() -> dict[Mutant, str]:
+    """Return what was decided of every mutant of the compiled tick."""
+    text = KERNEL_RESULTS.read_text() if KERNEL_RESULTS.is_file() else "[]"
+    return {Mutant(*one): status for *one, status in json.loads(text)}
 
 
 def kernel(run: bool) -> int:
     """Run all mutants of the compiled tick and print what became of them; return 0 if all are explained."""
     if run:
         run_kernel_mutants()
-    decided = json.loads(KERNEL_RESULTS.read_text())
-    survivors = [Mutant(*one) for one in decided["survivors"]]
+    decided = kernel_results()
+    survivors = [one for one, status in decided.items() if status == SURVIVED]
     reasons = {one: why for one, why in explained().items() if is_of_kernel(one)}
     open_ones = [one for one in survivors if one not in reasons]
-    noticed, known = decided["mutants"] - len(survivors), len(survivors) - len(open_ones)
+    waiting = len({one for one, _ in kernel_mutants()} - decided.keys())
+    noticed, known = len(decided) - len(survivors), len(survivors) - len(open_ones)
     print(
-        f"{decided['mutants']} mutants of {KERNEL}: {noticed} noticed, {known} explained in "
-        f"{SURVIVORS.relative_to(ROOT)}, {len(open_ones)} neither"
+        f"{len(decided)} mutants of {KERNEL}: {noticed} noticed, {known} explained in "
+        f"{SURVIVORS.relative_to(ROOT)}, {len(open_ones)} neither, {waiting} not checked"
     )
     for one in open_ones:
         print(f"\nnot explained: {one.where}\n- {one.was}\n+ {one.becomes}")
-    print_needless(reasons.keys() - set(survivors))
-    return 1 if open_ones else 0
+    if not waiting:
+        print_needless(reasons.keys() - set(survivors))
+    return 1 if open_ones or waiting else 0
 
 
 def main(arguments: list[str]) -> int:
