@@ -205,14 +205,18 @@ def _module(file: str) -> str:
     return file.removesuffix(".py").replace("/", ".")
 
 
-def kernel_mutants() -> list[tuple[Mutant, str]]:
-    """Return all mutants of the compiled tick, each with the source of its file."""
+def kernel_mutants() -> dict[tuple[Mutant, int], str]:
+    """Return all mutants of the compiled tick, each with the source of its file.
+
+    A line that a function has several times is changed once in each place: such mutants have numbers.
+    """
     from mutmut.mutation.file_mutation import create_mutations, deep_replace
 
     # It passes decorated functions by.
     plain = (ROOT / KERNEL).read_text().replace("@compiled\n", "")
     tree, mutations, *_ = create_mutations(KERNEL, plain)
-    found = []
+    found: dict[tuple[Mutant, int], str] = {}
+    seen: Counter[Mutant] = Counter()
     for mutation in mutations:
         function = mutation.contained_by_top_level_function
         if function is None:
@@ -224,7 +228,9 @@ def kernel_mutants() -> list[tuple[Mutant, str]]:
             "\n".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in ("-", "+")
         )
         source = re.sub("^def ", "@compiled\ndef ", plain.replace(before, after), flags=re.MULTILINE)
-        found.append((Mutant(f"{_module(KERNEL)}.{function.name.value}", was, becomes), source))
+        one = Mutant(f"{_module(KERNEL)}.{function.name.value}", was, becomes)
+        found[one, seen[one]] = source
+        seen[one] += 1
     return found
 
 
@@ -266,8 +272,8 @@ def _end_by_tests(source: str) -> None:
 def run_kernel_mutants() -> None:
     """Run all mutants of the compiled tick that are not decided, and keep what becomes of them."""
     decided = kernel_results()
-    waiting = [(one, source) for one, source in kernel_mutants() if one not in decided]
-    running: dict[int, tuple[Any, Mutant]] = {}
+    waiting = [(one, source) for one, source in kernel_mutants().items() if one not in decided]
+    running: dict[int, tuple[Any, tuple[Mutant, int]]] = {}
     while waiting or running:
         while waiting and len(running) < (os.cpu_count() or 1):
             one, source = waiting.pop()
@@ -283,16 +289,17 @@ def run_kernel_mutants() -> None:
             # One that writes beyond its arrays may end its process: that is noticed, too.
             decided[one] = SURVIVED if process.exitcode == 0 else KILLED
         KERNEL_RESULTS.parent.mkdir(exist_ok=True)
-        KERNEL_RESULTS.write_text(json.dumps([[*one, status] for one, status in decided.items()]))
+        kept = [[*one, number, status] for (one, number), status in decided.items()]
+        KERNEL_RESULTS.write_text(json.dumps(kept))
         alive = sum(status == SURVIVED for status in decided.values())
         print(f"\r{len(decided)} decided, {len(waiting)} wait, {alive} not noticed", end="", flush=True)
     print()
 
 
-def kernel_results() -> dict[Mutant, str]:
+def kernel_results() -> dict[tuple[Mutant, int], str]:
     """Return what was decided of every mutant of the compiled tick."""
     text = KERNEL_RESULTS.read_text() if KERNEL_RESULTS.is_file() else "[]"
-    return {Mutant(*one): status for *one, status in json.loads(text)}
+    return {(Mutant(*one), number): status for *one, number, status in json.loads(text)}
 
 
 def kernel(run: bool) -> int:
@@ -300,10 +307,10 @@ def kernel(run: bool) -> int:
     if run:
         run_kernel_mutants()
     decided = kernel_results()
-    survivors = [one for one, status in decided.items() if status == SURVIVED]
+    survivors = [one for (one, _), status in decided.items() if status == SURVIVED]
     reasons = {one: why for one, why in explained().items() if is_of_kernel(one)}
     open_ones = [one for one in survivors if one not in reasons]
-    waiting = len({one for one, _ in kernel_mutants()} - decided.keys())
+    waiting = len(kernel_mutants().keys() - decided.keys())
     noticed, known = len(decided) - len(survivors), len(survivors) - len(open_ones)
     print(
         f"{len(decided)} mutants of {KERNEL}: {noticed} noticed, {known} explained in "

@@ -72,10 +72,10 @@ def test_a_zip_that_is_loose_is_one_that_lost_its_strictness_and_nothing_else(
 
 def test_a_wrong_compiled_tick_is_noticed_and_the_right_one_is_not() -> None:
     """Each is compiled in a process of its own, beside the machine code that is kept."""
-    mutants = dict(kernel_mutants())
+    mutants = kernel_mutants()
     (wrong,) = (
         source
-        for one, source in mutants.items()
+        for (one, _), source in mutants.items()
         if (one.was, one.becomes) == ("if bad == 0:", "if bad != 0:") or "return bad != 0" in one.becomes
     )
     right = (ROOT / KERNEL).read_text()
