@@ -21,7 +21,7 @@ help:
 	@echo "make test-all  these, and further robots, seeds and settings of what they tell; half as long again"
 	@echo "make coverage  branch coverage of what runs in one process"
 	@echo "make safety  branch coverage of the safety core, which must be whole"
-	@echo "make mutants every change of the safety core that its tests do not notice; half an hour, goes on where it stopped"
+	@echo "make mutants every change of the safety core that its tests do not notice; two hours, goes on where it stopped"
 	@echo "make check   format, lint, types, floors and doors"
 	@echo "make bench   benchmarks"
 	@echo "make clean   remove .venv and caches; runs/ stays"
@@ -84,6 +84,7 @@ safety: $(DEV)
 
 mutants: $(DEV)
 	$(BIN)/python -m tests.safety_core mutants
+	$(BIN)/python -m tests.safety_core kernel
 
 check: $(DEV)
 	$(BIN)/ruff format --check .

@@ -142,9 +142,13 @@ def makes_zip_loose(one: Mutant) -> bool:
 
 
 def explained() -> dict[Mutant, str]:
-    """Return the survivors that are explained, with their reasons."""
-    entries = tomllib.loads(SURVIVORS.read_text(encoding="utf-8")).get("survivor", [])
-    return {Mutant(e["where"], e["was"].strip(), e["becomes"].strip()): e["why"] for e in entries}
+    """Return the survivors that are explained, with their reasons; several of a line may share one."""
+    reasons = {}
+    for entry in tomllib.loads(SURVIVORS.read_text(encoding="utf-8")).get("survivor", []):
+        becomes = entry["becomes"]
+        for one in [becomes] if isinstance(becomes, str) else becomes:
+            reasons[Mutant(entry["where"], entry["was"].strip(), one.strip())] = entry["why"]
+    return reasons
 
 
 def run_mutants(*names: str) -> None:
