@@ -42,9 +42,10 @@ ITERATIONS = 20
 # The last step in standard deviations: smaller ones cost time and tell nothing.
 CONVERGED_SIGMAS = 0.03
 # Fits from which others start lack what those add, links that give or hinges in their places: how often they
-# step at most, and their last step. It is enough, too, of what only the motion of the base tells: nothing is
-# claimed of that.
+# step at most, and their last step.
 COARSE_ITERATIONS, COARSE_SIGMAS = 8, 0.1
+# How much larger the last step may be along what only the base's motion tells: nothing is claimed of that.
+UNCLAIMED = 3.0
 # Directions with a larger sigma (rad or m) count as unresolved: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
 # Largest step (rad, m) along directions that only the motion of the base resolves.
@@ -161,7 +162,7 @@ def refine_chain(
             sigmas = [_spread(data, residual) for residual in expected.residuals]
         state, last, by_shaking = _stepped(problem, state, expected, sigmas, settled)
         # The first two steps are by weights that are guessed, or of a state that is far off.
-        settled = used > 2 and by_shaking < COARSE_SIGMAS
+        settled = used > 2 and by_shaking < UNCLAIMED * converged
         if settled and last < converged:
             break
     return _concluded(problem, state, noise, coarse)

@@ -110,24 +110,40 @@ def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool
 
     gyro, accel: (m, ..., 3) true values. rates: (m, ..., 6) or None. free: (34,).
     """
+    signals, (errors, rows) = error_signals(gyro, accel, rates), axis_errors(free)
     derivatives = np.zeros((SIZE, 6, *gyro.T.shape[1:]))
     for axis in range(6):
-        errors, by_error = axis_slopes(gyro, accel, rates, axis)
-        derivatives[errors, axis] = by_error
+        its = errors[axis] >= 0
+        derivatives[errors[axis, its], axis] = signals[rows[axis, its]]
     return derivatives[free]
 
 
-def axis_slopes(gyro: Array, accel: Array, rates: Array | None, axis: int) -> tuple[Index, Array]:
-    """Return on which errors an axis of IMUs depends, and its readings' derivatives by them (k, ..., m).
+def error_signals(gyro: Array, accel: Array, rates: Array | None) -> Array:
+    """Return the signals by which IMUs' errors are multiplied in their readings, (14, ..., m).
 
-    gyro, accel: (m, ..., 3) true values. rates: (m, ..., 6) of the readings, or None without delays. axis: 0
-    to 2 of the gyro, 3 to 5 of the accelerometer.
+    These are the true rates (3) and forces (3), one, minus their rates (6), and zero.
+    gyro, accel: (m, ..., 3) true values. rates: (m, ..., 6) of the readings, or None without delays.
     """
-    matrix, bias, by_axis = 3 * axis + np.arange(3), GYRO_BIAS.start + axis, (gyro if axis < 3 else accel).T
-    parts = [(matrix, by_axis), ([bias], np.ones((1, *by_axis.shape[1:])))]
+    signals = np.zeros((14, *gyro.T.shape[1:]))
+    signals[:3], signals[3:6], signals[6] = gyro.T, accel.T, 1.0
     if rates is not None:
-        parts.append(([DELAY], -rates[..., axis].T[None]))
-    if axis < 3:
-        parts.append((FORCE.start + matrix, accel.T))
-    errors, derivatives = zip(*parts, strict=True)
-    return np.concatenate(errors), np.concatenate(derivatives)
+        signals[7:13] = -rates.T
+    return signals
+
+
+def axis_errors(free: NDArray[np.bool_]) -> tuple[Index, Index]:
+    """Return on which free errors each axis of an IMU depends, (6, p), and on which of `error_signals`.
+
+    An axis that depends on fewer errors than others has -1 for an error, and the signal that is zero. The
+    first three axes are the gyro's.
+    """
+    errors, rows = np.full((6, 8), -1), np.full((6, 8), 13)
+    for axis in range(6):
+        matrix = 3 * axis + np.arange(3)
+        true, force = (range(3), FORCE.start + matrix) if axis < 3 else (range(3, 6), 3 * [-1])
+        errors[axis] = [*matrix, GYRO_BIAS.start + axis, DELAY, *force]
+        rows[axis] = [*true, 6, 7 + axis, *range(3, 6)]
+    errors[(errors >= 0) & ~free[errors]] = -1
+    rows[errors < 0] = 13
+    kept = (errors >= 0).any(axis=0)
+    return errors[:, kept], rows[:, kept]

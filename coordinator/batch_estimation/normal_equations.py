@@ -17,7 +17,7 @@ from scipy.linalg.blas import dsyrk
 
 from coordinator.batch_estimation.imu_calibration import ImuCalibration
 from coordinator.batch_estimation.imu_intrinsics import SIZE as ERRORS
-from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, axis_slopes, mixing
+from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, axis_errors, error_signals, mixing
 from coordinator.batch_estimation.imu_jacobian import (
     Motion,
     SeenDisplacements,
@@ -228,23 +228,28 @@ def _share(
     motions = np.zeros(len(data.q_rad), dtype=np.int64) if data.motion is None else data.motion
     weight = 1.0 / np.stack([sigma[:, k] for sigma in sigmas])[:, motions]
     residual = np.concatenate([part[:, k] for part in expected.residuals], axis=1).T
-    own_of, by_own = _own_slopes(problem, expected, weight, k, motion.bodies.shape[2])
-    at, count = layout.at(path, seen), own_of.shape[1]
+    errors, rows = axis_errors(problem.free[:ERRORS])
+    signals = _error_signals(problem, expected, weight, k, motion.bodies.shape[2])
+    of_sensor, placement = np.arange(6)[:, None] // 3, np.arange(ERRORS, len(problem.free))
+    at, count = layout.at(path, seen), errors.shape[1] + len(placement)
     shared = np.zeros((len(at), len(at)), order="F")
     crosses, owns = np.zeros((6, count, len(at))), np.zeros((6, count, count))
     mixed = mixing(state.imus, k)
     blocks = weighted_slopes(path, motion, problem.displaced, seen, mixed, weight, residual)
-    for block, rows, placed in blocks:
-        shared = dsyrk(1.0, rows.reshape(len(rows), -1).T, trans=1, beta=1.0, c=shared, overwrite_c=1)
+    for block, slopes, placed in blocks:
+        flat = slopes.reshape(len(slopes), -1).T
+        shared = dsyrk(1.0, flat, trans=1, beta=1.0, c=shared, overwrite_c=1)
         # The errors of an axis are its own.
-        own = by_own[..., block]
-        own[:, -len(placed) :] = placed.transpose(1, 0, 2)
-        crosses += own @ rows.transpose(1, 2, 0)
+        own = np.empty((6, count, placed.shape[2]))
+        own[:, : rows.shape[1]] = signals[of_sensor, rows, block]
+        own[:, rows.shape[1] :] = placed.transpose(1, 0, 2)
+        crosses += own @ slopes.transpose(1, 2, 0)
         owns += own @ own.transpose(0, 2, 1)
     number, size = np.cumsum(problem.free) - 1, int(problem.free.sum())
     share = _Share(at, shared, np.zeros((size, len(at))), np.zeros((size, size)))
     is_free = np.append(problem.free, False)
-    for parameters, cross, inner in zip(own_of, crosses, owns, strict=True):
+    for of_axis, cross, inner in zip(errors, crosses, owns, strict=True):
+        parameters = np.concatenate([of_axis, placement])
         kept = is_free[parameters]
         free = number[parameters[kept]]
         share.cross[free] += cross[kept]
@@ -252,25 +257,14 @@ def _share(
     return share
 
 
-def _own_slopes(
-    problem: Problem, expected: Expected, weight: Array, k: int, places: int
-) -> tuple[Index, Array]:
-    """Return on which of its own parameters each axis of an IMU depends, (6, p), and the slopes by them.
-
-    Of the slopes, (6, p, m') at m' places, those by the placement, the last ones, are not filled in. Axes
-    that depend on fewer errors than others have slopes of zero, by the parameter -1.
-    """
+def _error_signals(problem: Problem, expected: Expected, weight: Array, k: int, places: int) -> Array:
+    """Return `error_signals` of one IMU by the weights of its gyro and of its accelerometer, (2, 14, m')."""
     samples, rates = weight.shape[1], problem.data.imu_rates
     true = expected.ideal.gyro_rad_s[:, k], expected.ideal.accel_m_s2[:, k]
-    each = [axis_slopes(*true, None if rates is None else rates[:, k], axis) for axis in range(6)]
-    most, placement = max(len(errors) for errors, _ in each), np.arange(ERRORS, len(problem.free))
-    parameters = np.full((6, most + len(placement)), -1)
-    parameters[:, most:] = placement
-    slopes = np.zeros((*parameters.shape, places))
-    for axis, (errors, by_error) in enumerate(each):
-        parameters[axis, : len(errors)] = errors
-        slopes[axis, : len(errors), :samples] = by_error * weight[axis // 3]
-    return parameters, slopes
+    signals = np.zeros((2, 14, places))
+    signals[..., :samples] = error_signals(*true, None if rates is None else rates[:, k])
+    signals[..., :samples] *= weight[:, None]
+    return signals
 
 
 def _add_prior(problem: Problem, state: State, information: Array, poses: int) -> None:
