@@ -18,16 +18,20 @@ is run a second time when all others are done, and counts if it hangs again.
 
 Most ticks are decided by a compiled copy of the core, `KERNEL`. mutmut makes the same changes of it, but
 cannot run them: a kernel calls no function that is exchanged at run time. `kernel` compiles each changed copy
-anew, in a process of its own, and looks whether the tests that compare it with the core notice.
+anew, in a process of its own, and looks whether the tests that compare it with the core notice. A change that
+numba does not compile is noticed. The kernel's loops run over arrays of given lengths, so that none hangs.
+What was decided counts for this kernel and these tests: after a change of either it begins anew.
 """
 
 import contextlib
 import difflib
+import hashlib
 import io
 import json
 import multiprocessing
 import os
 import re
+import signal
 import subprocess
 import sys
 import tokenize
@@ -37,6 +41,8 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from module_agent.model.files import replacing
+
 ROOT = Path(__file__).parents[1]
 SURVIVORS = Path(__file__).parent / "module_agent" / "survivors.toml"
 KILLED, SURVIVED, NOT_CHECKED, HANGS = "killed", "survived", "not checked", "timeout"
@@ -45,14 +51,20 @@ KERNEL_TESTS = "tests/module_agent/firmware/test_quiet_ticks.py"
 KERNEL_RESULTS = ROOT / "mutants" / "tick_kernel.json"
 # What a process says by its exit code.
 NOTICED = 3
+# How a mutant may end its process that writes beyond its arrays: that is noticed, too.
+ENDED_BY_ITSELF = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL)
 
 
 class Mutant(NamedTuple):
-    """One change: the function that it is in, and the lines before and after it, not indented."""
+    """One change: the function that it is in, and the lines before and after it, not indented.
+
+    place: which of several equal lines of the function it changes, of the compiled tick.
+    """
 
     where: str
     was: str
     becomes: str
+    place: int = 0
 
 
 class Core(NamedTuple):
@@ -147,14 +159,15 @@ def explained() -> dict[Mutant, str]:
     for entry in tomllib.loads(SURVIVORS.read_text(encoding="utf-8")).get("survivor", []):
         becomes = entry["becomes"]
         for one in [becomes] if isinstance(becomes, str) else becomes:
-            reasons[Mutant(entry["where"], entry["was"].strip(), one.strip())] = entry["why"]
+            mutant = Mutant(entry["where"], entry["was"].strip(), one.strip(), entry.get("place", 0))
+            reasons[mutant] = entry["why"]
     return reasons
 
 
 def run_mutants(*names: str) -> None:
     """Run the mutants of these names, or all that are not decided."""
     command = [sys.executable, "-m", "mutmut", "run", *names]
-    subprocess.call(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    subprocess.call(command, cwd=ROOT)
 
 
 def mutants(run: bool) -> int:
@@ -209,17 +222,14 @@ def _module(file: str) -> str:
     return file.removesuffix(".py").replace("/", ".")
 
 
-def kernel_mutants() -> dict[tuple[Mutant, int], str]:
-    """Return all mutants of the compiled tick, each with the source of its file.
-
-    A line that a function has several times is changed once in each place: such mutants have numbers.
-    """
+def kernel_mutants() -> dict[Mutant, str]:
+    """Return all mutants of the compiled tick, each with the source of its file."""
     from mutmut.mutation.file_mutation import create_mutations, deep_replace
 
     # It passes decorated functions by.
     plain = (ROOT / KERNEL).read_text().replace("@compiled\n", "")
     tree, mutations, *_ = create_mutations(KERNEL, plain)
-    found: dict[tuple[Mutant, int], str] = {}
+    found: dict[Mutant, str] = {}
     seen: Counter[Mutant] = Counter()
     for mutation in mutations:
         function = mutation.contained_by_top_level_function
@@ -231,9 +241,9 @@ def kernel_mutants() -> dict[tuple[Mutant, int], str]:
         was, becomes = (
             "\n".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in ("-", "+")
         )
-        source = re.sub("^def ", "@compiled\ndef ", plain.replace(before, after), flags=re.MULTILINE)
         one = Mutant(f"{_module(KERNEL)}.{function.name.value}", was, becomes)
-        found[one, seen[one]] = source
+        source = re.sub("^def ", "@compiled\ndef ", plain.replace(before, after), flags=re.MULTILINE)
+        found[one._replace(place=seen[one])] = source
         seen[one] += 1
     return found
 
@@ -249,17 +259,9 @@ def is_noticed(source: str) -> bool:
         "kernel", phases=[Phase.generate], report_multiple_bugs=False, derandomize=True, database=None
     )
     settings.load_profile("kernel")
-    options = [
-        "-x",
-        "-q",
-        "-o",
-        "addopts=",
-        "--import-mode=importlib",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:faulthandler",
-    ]
+    os.environ.pop("PYTEST_ADDOPTS", None)
+    options = ["-x", "-q", "-o", "addopts=", "--import-mode=importlib"]
+    options += ["-p", "no:cacheprovider", "-p", "no:faulthandler"]
     with contextlib.redirect_stdout(io.StringIO()) as said:
         # Where a source has no file, its machine code is not taken from what is kept on disk.
         exec(compile(source, "<mutant>", "exec"), vars(tick_kernel))
@@ -277,7 +279,7 @@ def run_kernel_mutants() -> None:
     """Run all mutants of the compiled tick that are not decided, and keep what becomes of them."""
     decided = kernel_results()
     waiting = [(one, source) for one, source in kernel_mutants().items() if one not in decided]
-    running: dict[int, tuple[Any, tuple[Mutant, int]]] = {}
+    running: dict[int, tuple[Any, Mutant]] = {}
     while waiting or running:
         while waiting and len(running) < (os.cpu_count() or 1):
             one, source = waiting.pop()
@@ -288,22 +290,30 @@ def run_kernel_mutants() -> None:
         for sentinel in wait(list(running)):
             process, one = running.pop(sentinel)  # type: ignore[index]
             process.join()
-            if process.exitcode not in (0, NOTICED) and process.exitcode >= 0:
+            if process.exitcode not in (0, NOTICED, *(-end for end in ENDED_BY_ITSELF)):
                 raise RuntimeError(f"the tests of {one} ended with {process.exitcode}")
-            # One that writes beyond its arrays may end its process: that is noticed, too.
             decided[one] = SURVIVED if process.exitcode == 0 else KILLED
         KERNEL_RESULTS.parent.mkdir(exist_ok=True)
-        kept = [[*one, number, status] for (one, number), status in decided.items()]
-        KERNEL_RESULTS.write_text(json.dumps(kept))
+        kept = {"of": _digest(), "decided": [[*one, status] for one, status in decided.items()]}
+        with replacing(KERNEL_RESULTS) as temporary:
+            temporary.write_text(json.dumps(kept))
         alive = sum(status == SURVIVED for status in decided.values())
         print(f"\r{len(decided)} decided, {len(waiting)} wait, {alive} not noticed", end="", flush=True)
     print()
 
 
-def kernel_results() -> dict[tuple[Mutant, int], str]:
-    """Return what was decided of every mutant of the compiled tick."""
-    text = KERNEL_RESULTS.read_text() if KERNEL_RESULTS.is_file() else "[]"
-    return {(Mutant(*one), number): status for *one, number, status in json.loads(text)}
+def kernel_results() -> dict[Mutant, str]:
+    """Return what was decided of every mutant of the compiled tick as it and its tests are."""
+    kept = json.loads(KERNEL_RESULTS.read_text()) if KERNEL_RESULTS.is_file() else {"of": None}
+    if kept["of"] != _digest():
+        return {}
+    return {Mutant(*one): status for *one, status in kept["decided"]}
+
+
+def _digest() -> str:
+    """Return what tells the kernel and its tests from others."""
+    files = b"".join((ROOT / path).read_bytes() for path in (KERNEL, KERNEL_TESTS))
+    return hashlib.sha256(files).hexdigest()
 
 
 def kernel(run: bool) -> int:
@@ -311,7 +321,7 @@ def kernel(run: bool) -> int:
     if run:
         run_kernel_mutants()
     decided = kernel_results()
-    survivors = [one for (one, _), status in decided.items() if status == SURVIVED]
+    survivors = [one for one, status in decided.items() if status == SURVIVED]
     reasons = {one: why for one, why in explained().items() if is_of_kernel(one)}
     open_ones = [one for one in survivors if one not in reasons]
     waiting = len(kernel_mutants().keys() - decided.keys())
@@ -321,7 +331,7 @@ def kernel(run: bool) -> int:
         f"{SURVIVORS.relative_to(ROOT)}, {len(open_ones)} neither, {waiting} not checked"
     )
     for one in open_ones:
-        print(f"\nnot explained: {one.where}\n- {one.was}\n+ {one.becomes}")
+        print(f"\nnot explained: {one.where}, place {one.place}\n- {one.was}\n+ {one.becomes}")
     if not waiting:
         print_needless(reasons.keys() - set(survivors))
     return 1 if open_ones or waiting else 0
@@ -329,6 +339,7 @@ def kernel(run: bool) -> int:
 
 def main(arguments: list[str]) -> int:
     """Run one of the commands."""
+    os.environ["OMP_NUM_THREADS"] = "1"
     run = "--report" not in arguments
     commands: dict[str, Any] = {
         "coverage": coverage,
