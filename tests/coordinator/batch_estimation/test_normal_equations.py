@@ -19,7 +19,7 @@ from coordinator.batch_estimation.normal_equations import Expected, Problem, Sta
 from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array
-from module_agent.model.imu_prior import UNCALIBRATED
+from module_agent.model.imu_prior import BIASES_ONLY, UNCALIBRATED, ImuPrior
 from tests.random_chains import displaced
 
 # More than one block of them, and no multiple of the kernels' groups.
@@ -27,7 +27,9 @@ SAMPLES = 300
 Joints = tuple[Array, Array, Array]
 
 
-def _problem(robots: Any, seed: int, joints: int, coupled: bool) -> tuple[Problem, State, Joints]:
+def _problem(
+    robots: Any, seed: int, joints: int, coupled: bool, prior: ImuPrior = UNCALIBRATED
+) -> tuple[Problem, State, Joints]:
     """A random tree whose links and first encoder give, at some state of its parameters."""
     rng = np.random.default_rng(seed)
     chain, _ = robots.random(seed, joints=joints, roots=1 + seed % 2)
@@ -45,7 +47,7 @@ def _problem(robots: Any, seed: int, joints: int, coupled: bool) -> tuple[Proble
         rng.normal(size=(len(links) // 2 + 1, 18, SAMPLES)),
     )
     flex = ComplianceJacobian(np.full(len(links) + 1, 3.0), carried, rng.normal(size=len(links) + 1))
-    known = catalogued(chain.serials, UNCALIBRATED)
+    known = catalogued(chain.serials, prior)
     if coupled:
         size = known.sigma.ravel()
         factors = rng.normal(size=(len(size), 3))
@@ -112,8 +114,11 @@ def _dense(problem: Problem, state: State, joints: Joints, sigmas: list[Array]) 
     of_links = slice(6 * count + 3, first)
     information[of_links, of_links] += np.diag(problem.flex.sigmas**-2.0)
     rhs[of_links] -= problem.flex.sigmas**-2.0 * (state.compliance + problem.flex.taken)
+    # What is not free of the IMUs is no parameter.
+    free = np.concatenate([np.arange(first), first + np.flatnonzero(np.tile(problem.free, count))])
+    information, rhs = information[np.ix_(free, free)], rhs[free]
     information[first:, first:] += problem.known
-    rhs[first:] += problem.known @ (problem.calibration.mean - state.own).ravel()
+    rhs[first:] += problem.known @ (problem.calibration.mean - state.own)[:, problem.free].ravel()
     return information, rhs
 
 
@@ -122,11 +127,14 @@ def _close(found: Array, expected: Array, relative: float = 1e-10) -> None:
 
 
 @pytest.mark.parametrize("coupled", [False, True])
-@pytest.mark.parametrize(("seed", "joints"), [(0, 2), (1, 4), (2, 6), (3, 7)])
+@pytest.mark.parametrize(
+    ("seed", "joints", "prior"),
+    [(0, 2, UNCALIBRATED), (1, 4, UNCALIBRATED), (2, 6, BIASES_ONLY), (3, 7, UNCALIBRATED)],
+)
 def test_equations_by_paths_are_those_of_the_whole_jacobian(
-    robots: Any, seed: int, joints: int, coupled: bool
+    robots: Any, seed: int, joints: int, prior: ImuPrior, coupled: bool
 ) -> None:
-    problem, state, motion = _problem(robots, seed, joints, coupled)
+    problem, state, motion = _problem(robots, seed, joints, coupled, prior)
     sigmas = list(np.random.default_rng(seed).uniform(0.01, 0.1, (2, 3, joints)))
     expected, _ = _at(problem, state, motion)
     found = normal_equations(problem, state, expected, expected.still, sigmas)
