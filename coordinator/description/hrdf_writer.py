@@ -26,6 +26,7 @@ from coordinator.description.urdf_writer import (
     upright_pose,
     write_xml,
 )
+from coordinator.dynamics.inertia_prior import modules_alone
 from coordinator.dynamics.pseudo_inertia import body, is_consistent, nearest_consistent, pseudo_inertia
 from coordinator.kinematics.frames import distal_homes, housing_homes
 from module_agent.model.catalogue import ModuleType
@@ -38,14 +39,18 @@ SAME_BELOW = 1e-11
 
 
 class _Robot(NamedTuple):
-    """The frames before, after and at the moved face of every joint, its actuator and inertial parameters."""
+    """The frames before, after and at the moved face of every joint, its actuator and its body.
+
+    bodies: (n, 4, 4) pseudo-inertias. identified: whether those of the actuators are part of them.
+    """
 
     chain: Chain
     entry: Array
     leave: Array
     actuator: tuple[str | None, ...]
     tip: Array
-    bodies: Array | None
+    bodies: Array
+    identified: bool
     undetermined: Mapping[str, Sequence[str]]
 
 
@@ -60,7 +65,7 @@ def write_hrdf(
     """Write the robot of n joints, with a type each; the file is the complete old or the complete new one.
 
     phi: (10 n,) inertial parameters as in `torque_regressor`. They include the modules' own masses, so that
-    the actuators get none; without them the actuators have their types' and links none.
+    the actuators get none; without them modules have their types' mass and links none.
     undetermined: by the serial, parameters of its body that torques alone do not determine; a comment before
         the body names them.
 
@@ -80,19 +85,23 @@ def hrdf_element(
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_hrdf`."""
     housing, tip, axes = housing_homes(chain, types), distal_homes(chain, types), link_homes(chain)
-    bodies = None if phi is None else check_phi(chain, phi).reshape(len(chain.serials), PER_BODY)
     made = tuple(_actuator(chain, k, kind, tip[k]) for k, kind in enumerate(types))
+    if phi is None:
+        bodies = modules_alone(chain, types, [k for k, actuator in enumerate(made) if actuator is None])
+    else:
+        bodies = np.stack([pseudo_inertia(one) for one in check_phi(chain, phi).reshape(-1, PER_BODY)])
     is_made = np.array([m is not None for m in made])[:, None, None]
     entry, leave = np.where(is_made, housing, axes), np.where(is_made, tip, axes)
     rot = numbers(upright_pose(chain.gravity)[:3, :3])
     robot = Element("robot", version=VERSION, rot=rot, description=name)
     order = ", ".join(chain.serials[k] for k in joint_order(chain))
     comment(robot, f"Lengths in m. The order of the degrees of freedom: {order}.")
-    unidentified = "Masses of links are not identified: only the actuators have their types' mass."
+    unidentified = "Masses are not identified: modules have their types' mass, and links have none."
     comment(
         robot, unidentified if phi is None else "The modules' own masses are part of the identified bodies."
     )
-    _follow(robot, _Robot(chain, entry, leave, made, tip, bodies, undetermined), BASE, np.eye(4))
+    own = _Robot(chain, entry, leave, made, tip, bodies, phi is not None, undetermined)
+    _follow(robot, own, BASE, np.eye(4))
     return robot
 
 
@@ -142,7 +151,7 @@ def _joint(parent: Element, robot: _Robot, k: int) -> Array:
     if made is None:
         SubElement(parent, "joint", {"axis": "rz", "tag": serial})
     else:
-        none = {} if robot.bodies is None else dict.fromkeys(("mass", *INERTIA), "0")
+        none = dict.fromkeys(("mass", *INERTIA), "0") if robot.identified else {}
         SubElement(parent, "actuator", {"type": made, "tag": serial} | none)
     return np.asarray(robot.leave[k])
 
@@ -150,18 +159,22 @@ def _joint(parent: Element, robot: _Robot, k: int) -> Array:
 def _rigid(parent: Element, robot: _Robot, carrier: int, frame: Array, end: Array) -> None:
     """Add the body from `frame` to `end`, unless it is neither long nor heavy."""
     across = np.linalg.inv(frame) @ end
-    if np.abs(across - np.eye(4)).max() < SAME_BELOW and (robot.bodies is None or carrier == BASE):
+    if np.abs(across - np.eye(4)).max() < SAME_BELOW and not _is_heavy(robot, carrier):
         return
     SubElement(parent, "rigid-body", _mass(parent, robot, carrier, frame) | _pose(across, "output_"))
 
 
+def _is_heavy(robot: _Robot, carrier: int) -> bool:
+    return carrier != BASE and bool(robot.bodies[carrier].any())
+
+
 def _mass(parent: Element, robot: _Robot, carrier: int, frame: Array) -> dict[str, str]:
     """Return the mass attributes of a body in `frame`; a comment says where it had to be made a real one."""
-    if robot.bodies is None or carrier == BASE:
+    if not _is_heavy(robot, carrier):
         return {"mass": "0"}
     comment_undetermined(parent, robot.undetermined.get(robot.chain.serials[carrier], ()))
     into = np.linalg.inv(frame)
-    pseudo = into @ pseudo_inertia(robot.bodies[carrier]) @ into.T
+    pseudo = into @ robot.bodies[carrier] @ into.T
     if not is_consistent(pseudo):
         comment(
             parent,

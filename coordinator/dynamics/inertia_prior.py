@@ -48,16 +48,38 @@ def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array
     Raises:
         ValueError: there is not one type per module.
     """
-    housings, outputs = housing_homes(chain, types), output_homes(chain, types)
     leaves, enters = distal_homes(chain, types), proximal_homes(chain, types)
+    turned, held = _module_sides(chain, types)
+    for i in chain.linked:
+        held[i] += _link(leaves[chain.parent[i]][:3, 3], enters[i][:3, 3])
+    make_read_only((turned, held))
+    return turned, held
+
+
+def modules_alone(chain: Chain, types: Sequence[ModuleType], modules: Sequence[int]) -> Array:
+    """Return the pseudo-inertia of every body (n, 4, 4), of some modules by their types and without links.
+
+    In the root frame at q = 0, read-only. What they have on the base is left out.
+
+    Raises:
+        ValueError: there is not one type per module.
+    """
+    turned, held = _module_sides(chain, types)
+    bodies = np.zeros_like(turned)
+    for i in modules:
+        bodies[i] += turned[i]
+        if chain.parent[i] != BASE:
+            bodies[chain.parent[i]] += held[i]
+    return read_only(bodies)
+
+
+def _module_sides(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array]:
+    """Return the side that every module's joint moves, and the other one, (n, 4, 4) each."""
+    housings, outputs = housing_homes(chain, types), output_homes(chain, types)
     turned, held = np.zeros((2, len(chain.serials), 4, 4))
     for i, kind in enumerate(types):
         sides = _housing(kind, housings[i]), _output(kind, outputs[i])
         turned[i], held[i] = sides if chain.reversed[i] else sides[::-1]
-        parent = chain.parent[i]
-        if parent != BASE:
-            held[i] += _link(leaves[parent][:3, 3], enters[i][:3, 3])
-    make_read_only((turned, held))
     return turned, held
 
 

@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from coordinator.description.hrdf_writer import hrdf_element, joint_order, write_hrdf
 from coordinator.description.urdf_writer import upright_pose
+from coordinator.dynamics.inertia_prior import modules_alone
+from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.kinematics.frames import distal_homes
 from module_agent.model.catalogue import CATALOGUE, ModuleType
 from module_agent.model.chain import Array, Chain
@@ -217,6 +219,24 @@ def compare(chain: Chain, types: Any, found: Robot, q: Array) -> None:
             np.testing.assert_allclose(found.at(frame, at), base @ displaced[k] @ tips[k], atol=1e-9)
 
 
+def check_torques(found: Robot, chain: Chain, phi: Any) -> None:
+    """Compare the torques of the bodies in a file, by pinocchio, with those of the regressor."""
+    model = pin.Model()
+    for tag, at, _ in found.joints:
+        model.addJoint(at.joint + 1, pin.JointModelRZ(), pin.SE3(at.pose), tag)
+    for at, mass, place, inertia in found.bodies:
+        if at.joint >= 0 and mass > 0.0:
+            into = pin.SE3(at.pose)
+            model.appendBodyToJoint(at.joint + 1, pin.Inertia(mass, place, inertia), into)
+    q, qd, qdd = default_rng(3).uniform(-2, 2, (3, 4, len(chain.serials)))
+    order = [chain.serials.index(tag) for tag in found.tags]
+    expected = inverse_dynamics(chain, phi, q, qd, qdd)
+    data = model.createData()
+    for k in range(4):
+        tau = pin.rnea(model, data, q[k, order], qd[k, order], qdd[k, order])
+        np.testing.assert_allclose(tau, expected[k, order], atol=1e-9)
+
+
 # ------------------------------------------------------------------ tests
 
 
@@ -273,21 +293,26 @@ def test_with_identified_bodies_the_torques_are_those_of_the_regressor(tmp_path:
     phi = true_inertia(robot).ravel()
     write_hrdf(tmp_path / "robot.hrdf", chain, types, phi)
     assert "no real body's" not in (tmp_path / "robot.hrdf").read_text()
+    check_torques(read(tmp_path / "robot.hrdf"), chain, phi)
+
+
+@pytest.mark.parametrize("name", ["a2085_04", "tree_y", "snake16"])
+def test_without_identified_bodies_modules_have_the_mass_of_their_types(tmp_path: Path, name: str) -> None:
+    """An actuator has it in the manufacturer's library, a module that is none to the format in its bodies."""
+    robot = load_robot(name)
+    chain, types = true_chain(robot), build_tree(robot).types
+    write_hrdf(tmp_path / "robot.hrdf", chain, types)
     found = read(tmp_path / "robot.hrdf")
-    model = pin.Model()
-    for tag, at, _ in found.joints:
-        model.addJoint(at.joint + 1, pin.JointModelRZ(), pin.SE3(at.pose), tag)
-    for at, mass, place, inertia in found.bodies:
-        if at.joint >= 0 and mass > 0.0:
-            into = pin.SE3(at.pose)
-            model.appendBodyToJoint(at.joint + 1, pin.Inertia(mass, place, inertia), into)
-    q, qd, qdd = default_rng(3).uniform(-2, 2, (3, 4, len(types)))
-    order = [chain.serials.index(tag) for tag in found.tags]
-    expected = inverse_dynamics(chain, phi, q, qd, qdd)
-    data = model.createData()
-    for k in range(4):
-        tau = pin.rnea(model, data, q[k, order], qd[k, order], qdd[k, order])
-        np.testing.assert_allclose(tau, expected[k, order], atol=1e-9)
+    made = {a.get("tag") for a in ElementTree.parse(tmp_path / "robot.hrdf").getroot().iter("actuator")}
+    others = [k for k, serial in enumerate(chain.serials) if serial not in made]
+    bodies = modules_alone(chain, types, others)
+    check_torques(found, chain, np.concatenate([parameters(one) for one in bodies]))
+    # A tenth of a module turns with its output, the rest with its housing; the base has no mass in the file.
+    moved = sum(
+        types[k].mass_kg * (1.0 if chain.parent[k] >= 0 else 0.9 if chain.reversed[k] else 0.1)
+        for k in others
+    )
+    assert sum(mass for _, mass, _, _ in found.bodies) == pytest.approx(moved)
 
 
 def test_without_identified_bodies_only_the_actuators_are_heavy(tmp_path: Path) -> None:
