@@ -32,7 +32,7 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
 from coordinator.live_robot.connection import Place, exposures, new_sender, open_connection
 from coordinator.live_robot.discovery import await_modules
-from coordinator.live_robot.messenger import Messenger, Record
+from coordinator.live_robot.messenger import COALESCED_S, Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.merge.run_arrays import read_held_out_arrays
 from coordinator.recording.recording import Entry, Recording
@@ -383,8 +383,9 @@ async def connect(
         warnings.warn(sentence, stacklevel=2)
     # That a hub is there already is as it should be.
     transport = open_connection(place, lambda text: None).transport
+    record = _recorder(recording, retained_rows)
     messenger = Messenger(
-        transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, _recorder(recording, retained_rows)
+        transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, record, coalesced_s=COALESCED_S
     )
     live = LiveRobot(messenger, ModuleGroup(messenger, recording, time.monotonic_ns, new_sender()), recording)
     try:

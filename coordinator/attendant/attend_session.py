@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from coordinator.attendant.attendant import Attendant, Measurement, Observation, Outcome, Patience, Step
 from coordinator.baseline.baseline_robot import BaselineRobot, load_baseline
-from coordinator.live_robot.messenger import Clock, Messenger, Post, Sender
+from coordinator.live_robot.messenger import COALESCED_S, Clock, Messenger, Post, Sender
 from coordinator.monitoring.findings import Finding
 from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
@@ -136,7 +136,10 @@ class AttendSession:
         """Look at the robot until it is to be measured, or until a time; return what is to be measured."""
         site, monitor = self._site, Monitor(reference, self._alarms_per_hour)
         live = LiveMonitor(monitor, site.clock, site.sender.name, self._listener.report, LOOK_S)
-        messenger = Messenger(site.connect(), site.robot, site.clock, site.post, live.record)
+        coalesced_s = None if site.inline else COALESCED_S
+        messenger = Messenger(
+            site.connect(), site.robot, site.clock, site.post, live.record, coalesced_s=coalesced_s
+        )
         wanted: Measurement | None = None
 
         def looked() -> bool:

@@ -14,7 +14,7 @@ from coordinator.commands.options import ConnectOptions, JsonFile, Speed
 from coordinator.commands.views.module_table import ModuleScreen
 from coordinator.commands.views.monitor import MonitorScreen
 from coordinator.live_robot.connection import Place, new_sender, open_connection
-from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.messenger import COALESCED_S, Messenger
 from coordinator.monitoring.live import UPDATE_S, LiveMonitor, retained_rows
 from coordinator.monitoring.live_states import LiveStates
 from coordinator.monitoring.module_states import ModuleState, ModuleStates
@@ -127,7 +127,8 @@ def _show_modules(
     begin_ns = loop.clock_ns()
     screen = ModuleScreen(place.robot, json_file, at.quiet, _keys())
     transport = open_connection(place, screen.note).transport
-    messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, states.record)
+    post = loop.call_soon_threadsafe
+    messenger = Messenger(transport, place.robot, loop.clock_ns, post, states.record, coalesced_s=COALESCED_S)
     ended = False
 
     def report(modules: Sequence[ModuleState]) -> None:
@@ -217,7 +218,8 @@ def _monitor_live(
             states.record(entry)
         return live.record(entry)
 
-    messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, record)
+    post = loop.call_soon_threadsafe
+    messenger = Messenger(transport, place.robot, loop.clock_ns, post, record, coalesced_s=COALESCED_S)
     modules = LiveStates(states, messenger, loop.clock_ns, sender, screen.show_modules, screen.note)
 
     def end() -> None:

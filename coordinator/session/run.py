@@ -39,7 +39,7 @@ from coordinator.identification.preview import Preview, Previewer
 from coordinator.identification.result import Result, write_result
 from coordinator.identification.topology_search import doubtful_motions
 from coordinator.live_robot.errors import ModuleLost
-from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Post, Refused, Sender
+from coordinator.live_robot.messenger import COALESCED_S, Clock, Messenger, NoAnswer, Post, Refused, Sender
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.merge.calibration_file import each_once, read_calibration, write_calibration
 from coordinator.merge.information_file import RunInformation, write_information
@@ -212,8 +212,8 @@ class Run:
         if crashed is not None:
             self._take_over(crashed)
         # Virtual time has no cost of its own that would be one of the machine's.
-        cpu_clock = None if config.inline else time.thread_time_ns
-        self._messenger = Messenger(transport, config.robot, clock, post, self._record, cpu_clock)
+        real = (None, None) if config.inline else (time.thread_time_ns, COALESCED_S)
+        self._messenger = Messenger(transport, config.robot, clock, post, self._record, *real)
         gate = config.gate.admit if config.gate is not None else None
         self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender, gate)
         self._requests = InformationRequests(

@@ -21,7 +21,7 @@ import zenoh
 import zmq
 from numpy.typing import NDArray
 
-from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.messenger import COALESCED_S, Messenger
 from coordinator.recording.recording import Entry, Recording
 from module_agent.transport.zenoh_transport import ZenohConfig, _session_config, open_zenoh
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
@@ -187,7 +187,9 @@ def _product_round(seconds: float, boot: int) -> Round:
         loop = asyncio.get_running_loop()
         transport = open_zenoh(ZenohConfig.hub(endpoint))
         messenger = Messenger(
-            transport, ROBOT, time.monotonic_ns, loop.call_soon_threadsafe, record, time.thread_time_ns
+            *(transport, ROBOT, time.monotonic_ns, loop.call_soon_threadsafe, record),
+            time.thread_time_ns,
+            COALESCED_S,
         )
         messenger.start()
         publishers = Publishers("product", endpoint, seconds, boot)

@@ -252,6 +252,90 @@ def test_messages_are_recorded_with_the_time_of_their_delivery(wire: SimpleNames
     bench.loop.close()
 
 
+@pytest.fixture
+def coalescing(bench: Bench) -> tuple[Bench, Messenger, list[tuple[int, Entry]]]:
+    """A messenger that lets publications wait for 2 ms, and the time at which each entry was recorded."""
+    recorded = list[tuple[int, Entry]]()
+
+    def record(entry: Entry) -> Message | None:
+        recorded.append((bench.loop.now_ns, entry))
+        return bench._record(entry)
+
+    endpoint, clock, post = bench.network.endpoint("patient"), lambda: bench.loop.now_ns, bench.loop.call_soon
+    messenger = Messenger(endpoint, bench.wire.robot, clock, post, record, coalesced_s=2e-3)
+    messenger.start()
+    return bench, messenger, recorded
+
+
+def _publish_every_us(bench: Bench, period_us: float, count: int) -> None:
+    topic = key(bench.wire.robot, "A", Leaf.STATUS)
+    for number in range(count):
+        payload = encode(bench.wire.status(t_ns=number))
+        bench.loop.call_later(1e-6 * period_us * number, bench.module.publish, topic, payload)
+
+
+def test_of_publications_that_keep_coming_only_the_first_wakes_the_event_loop(
+    coalescing: tuple[Bench, Messenger, list[tuple[int, Entry]]],
+) -> None:
+    bench, _, recorded = coalescing
+    _publish_every_us(bench, 300, 100)
+    bench.run(asyncio.sleep(0.1))
+    assert [entry.t_ns for _, entry in recorded] == [300_000 * n for n in range(100)]
+    waited_ns = [at_ns - entry.t_ns for at_ns, entry in recorded]
+    assert waited_ns[0] == 0
+    assert max(waited_ns) <= 2_000_000
+    assert len({at_ns for at_ns, _ in recorded}) == 16  # 30 ms by 2 ms, and the first
+
+
+def test_a_publication_after_a_pause_wakes_the_event_loop(
+    coalescing: tuple[Bench, Messenger, list[tuple[int, Entry]]],
+) -> None:
+    bench, _, recorded = coalescing
+    _publish_every_us(bench, 5000, 4)
+    bench.run(asyncio.sleep(0.1))
+    assert [at_ns for at_ns, _ in recorded] == [0, 5_000_000, 10_000_000, 15_000_000]
+
+
+def test_an_answer_does_not_wait_with_publications(
+    coalescing: tuple[Bench, Messenger, list[tuple[int, Entry]]],
+) -> None:
+    bench, messenger, recorded = coalescing
+    wire, answered_ns = bench.wire, list[int]()
+    bench.serve(Leaf.STATUS, lambda request: encode(wire.status()))
+    _publish_every_us(bench, 300, 30)
+
+    async def ask() -> None:
+        await asyncio.sleep(3.4e-3)
+        await messenger.ask("A", Leaf.STATUS, wire.ask("A"))
+        answered_ns.append(bench.loop.now_ns)
+        await asyncio.sleep(0.1)
+
+    bench.run(ask())
+    assert answered_ns == [3_400_000]
+    # Nothing overtakes what came before it.
+    assert [entry.t_ns for _, entry in recorded if entry.kind != "request"] == sorted(
+        entry.t_ns for _, entry in recorded if entry.kind != "request"
+    )
+    assert len(recorded) == 32
+
+
+def test_what_cannot_be_recorded_leaves_the_publications_behind_it_to_the_next_look(bench: Bench) -> None:
+    def record(entry: Entry) -> Message | None:
+        if entry.t_ns == 600_000:
+            raise _Unrecordable(entry.topic)
+        return bench._record(entry)
+
+    endpoint, clock = bench.network.endpoint("patient"), lambda: bench.loop.now_ns
+    post = bench.loop.call_soon
+    messenger = Messenger(endpoint, bench.wire.robot, clock, post, record, coalesced_s=2e-3)
+    messenger.start()
+    _publish_every_us(bench, 300, 20)
+    with pytest.raises(_Unrecordable):
+        bench.run(asyncio.sleep(0.1))
+    bench.run(asyncio.sleep(0.1))
+    assert [entry.t_ns for entry in bench.entries] == [300_000 * n for n in range(20) if n != 2]
+
+
 class _Unrecordable(Exception):
     """What the recording raises: a defect of ours."""
 
