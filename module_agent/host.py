@@ -41,6 +41,7 @@ from module_agent.wire.messages import (
     EstimateRequest,
     Feedback,
     HistoryRequest,
+    LeaseRequest,
     Message,
     Status,
 )
@@ -53,6 +54,8 @@ MAX_ASKED = 1024
 # So many rows of motions may wait for their estimates: of 64 joints that moved at once for two minutes. The
 # shortest motion counts as so many, as a job has a size by itself.
 MAX_WAITING_ROWS, MIN_ROWS = 2_000_000, 100
+# Who keeps a lease alive sends fewer renewals within a tick; more of them are read like all else.
+MAX_RENEWALS = 4
 
 T = TypeVar("T")
 M = TypeVar("M", Status, Feedback, Ack)
@@ -85,6 +88,8 @@ class HostedModule:
         self.requests: dict[int, Request] = {}
         self._request_id = 0
         self._arrived: list[Event] = []
+        # What has arrived, if that is nothing but renewals of the lease: a quiet tick is quiet all the same.
+        self.renewals: list[Incoming] = []
         self._answers: list[Outgoing] = []
         self._seq = 0
         self._keys = {leaf: key(robot, config.serial, leaf) for leaf in Leaf}
@@ -114,18 +119,38 @@ class HostedModule:
         if self.stops.waiting or self.inbox.waiting:
             self._arrived = self.stops.drain(limit=len(self.stops)) + self.inbox.drain()
             self.firmware.dropped_events = self.inbox.dropped + self.stops.dropped
+            self.renewals = self._read_renewals()
         return bool(self._arrived)
+
+    def _read_renewals(self) -> list[Incoming]:
+        read: list[tuple[Request | Sample, Message]] = []
+        for event in self._arrived if len(self._arrived) <= MAX_RENEWALS else ():
+            if not isinstance(event, Request | Sample) or self._leaves[event.key] is not Leaf.LEASE:
+                return []
+            try:
+                message = self.firmware.admission.read(Leaf.LEASE, event.payload)
+            except WireError:
+                return []
+            if not isinstance(message, LeaseRequest) or message.action != "renew":
+                return []
+            read.append((event, message))
+        return [Incoming(Leaf.LEASE, event.payload, self._number(event), message) for event, message in read]
 
     def step(self, sample: ModuleSample) -> Command:
         """Begin a tick on what was collected before the sample was taken; return the module's command."""
         self.now_ns = max(0, sample.sensors.t_ns)
         if not self._arrived:
             return self.firmware.step(sample, ())
-        incoming: list[Incoming] = []
-        for event in self._arrived:
+        incoming, self.renewals = self.renewals, []
+        for event in () if incoming else self._arrived:
             self._sort(event, incoming)
         self._arrived = []
         return self.firmware.step(sample, incoming)
+
+    def attend(self, quiet: QuietTicks, place: int) -> list[Outgoing]:
+        """Read the renewals that were collected before a tick that was quiet; return what to send."""
+        renewals, self.renewals, self._arrived = self.renewals, [], []
+        return quiet.attend(place, renewals)
 
     def publish(self, pwm: float) -> list[Outgoing]:
         """End a tick with the module's PWM; return what to send."""
@@ -137,16 +162,19 @@ class HostedModule:
     def _sort(self, event: Event, incoming: list[Incoming]) -> None:
         if not isinstance(event, Request | Sample):
             return
-        leaf = self._leaves[event.key]
-        number: int | None = None
-        if isinstance(event, Request):
-            self._request_id += 1
-            number = self._request_id
-            self.requests[number] = event
+        leaf, number = self._leaves[event.key], self._number(event)
         if TOPICS[leaf].answered_by == "host" and number is not None:
             self._answers.append(Answer(number, self._answer(leaf, event.payload)))
         else:
             incoming.append(Incoming(leaf, event.payload, number))
+
+    def _number(self, event: Request | Sample) -> int | None:
+        """Return the number by which a question is answered, None for a publication."""
+        if not isinstance(event, Request):
+            return None
+        self._request_id += 1
+        self.requests[self._request_id] = event
+        return self._request_id
 
     def _answer(self, leaf: Leaf, payload: bytes) -> bytes:
         try:
@@ -224,6 +252,8 @@ class AgentHost:
         self._seq = 0
         self._place = place
         self._quiet = quiet
+        # Whether leases are renewed in this tick of modules that may be quiet.
+        self._renews = False
         self._bus_run: BusRun | None = None
         if isinstance(modules, LoopInside):
             self._loops = modules
@@ -286,21 +316,32 @@ class AgentHost:
 
     def _cycle_on_bus(self, bus: BusRun, busy: list[int]) -> None:
         assert self._quiet is not None
+        if self._renews:
+            # The tick is answered before they are read.
+            self.bell[0] = 1
         results = bus.run(busy, 1 if busy or self.has_work else MANY_TICKS)
         self.finish(bus.readings, results)
 
     def collect(self) -> list[int]:
-        """Take what has arrived for the modules; return the places of those for which something has.
+        """Take what has arrived for the modules; return the places of those that cannot be quiet for it.
 
         Before the sample: a process that freezes while it waits gets an old sample when it thaws; by the time
         of that sample all commands that arrived meanwhile would be fresh.
         """
-        return [self._place + k for k, module in enumerate(self.modules) if module.collect()]
+        busy = []
+        for place, module in enumerate(self.modules, self._place):
+            if module.collect():
+                if module.renewals and self._quiet is not None:
+                    self._renews = True
+                else:
+                    busy.append(place)
+        return busy
 
     def finish(self, readings: Readings, results: Sequence[int]) -> None:
         """Run what quiet ticks have left of a tick: modules that need their objects, and all that is sent."""
         quiet, places = self._quiet, range(self._place, self._place + len(self.modules))
         assert quiet is not None
+        self._renews = False
         if self.has_work or any(results[place] == NOT_QUIET for place in places):
             quiet.keep_held(places)
         if self._from_others.waiting:
@@ -316,10 +357,10 @@ class AgentHost:
                 command = module.step(self._loops.take(index, readings[place]))
                 out = module.publish(self._loops.run(index, command))
                 quiet.store(place)
-            elif results[place] == ROW_DUE:
-                out = quiet.keep_rows(place)
             else:
-                continue
+                out = module.attend(quiet, place) if module.renewals else []
+                if results[place] == ROW_DUE:
+                    out += quiet.keep_rows(place)
             for outgoing in out:
                 self._send(module, outgoing)
         self._attend()
@@ -329,7 +370,11 @@ class AgentHost:
         """Whether `finish` has anything to do in a tick that is quiet for all modules."""
         listener = self._motion_listener
         return bool(
-            self._from_others.waiting or listener.has_work or self.collection.has_work or self._findings
+            self._renews
+            or self._from_others.waiting
+            or listener.has_work
+            or self.collection.has_work
+            or self._findings
         )
 
     def _attend(self) -> None:

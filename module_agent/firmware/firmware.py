@@ -33,6 +33,7 @@ from module_agent.wire.messages import (
     Identify,
     Info,
     LeaseRequest,
+    Message,
     MotionCommand,
     MotionRecord,
     Setpoint,
@@ -54,11 +55,15 @@ WINDING_REARM_K = 14.0
 
 
 class Incoming(NamedTuple):
-    """Bytes that arrived for a module; `request` names the question to answer, None for a publication."""
+    """Bytes that arrived for a module; `request` names the question to answer, None for a publication.
+
+    message: what `Admission.read` has made of them, if they were read already.
+    """
 
     leaf: Leaf
     payload: bytes
     request: int | None
+    message: Message | None = None
 
 
 class Publication(NamedTuple):
@@ -248,6 +253,22 @@ class Firmware:
         self._command = Command(position_rad, velocity_rad_s, effort_nm)
         self._rows.go_on(due_ns, imu_ns)
 
+    def attend(self, now_ns: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
+        """Read renewals of the lease after a tick that was quiet without them; return the answers.
+
+        A tick reads them after it has looked for what is over, and they change nothing that it does then.
+        """
+        self._now_ns = now_ns
+        for incoming in renewals:
+            self._receive(incoming)
+        out, self._out = self._out, []
+        return out
+
+    @property
+    def valid_ns(self) -> tuple[int, int]:
+        """From when on the last command counts as fresh, and until when the lease is held."""
+        return self._fresh_ns, self.lease.until_ns
+
     @property
     def rows_to_batch(self) -> int:
         """How many feedback rows of quiet ticks complete the next batch to be sent."""
@@ -397,7 +418,7 @@ class Firmware:
             self._out.append(Answer(incoming.request, answer))
 
     def _dispatch(self, incoming: Incoming) -> bytes:
-        message = self.admission.read(incoming.leaf, incoming.payload)
+        message = incoming.message or self.admission.read(incoming.leaf, incoming.payload)
         if isinstance(message, LeaseRequest | MotionCommand | Setpoint | GainsCommand):
             self.admission.check_command(message, incoming.payload, self.lease, self._now_ns)
         match message:

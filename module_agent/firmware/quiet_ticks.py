@@ -3,15 +3,17 @@
 Most ticks are quiet: nothing has arrived, no time is up, no state changes. Then all modules are advanced by
 `tick_kernel.tick`; each of the others is run by its Python objects, which are the definition: `load` gives
 them what quiet ticks have changed, `store` takes what the kernel needs. What only Python changes (lease,
-state, motion, gains) is in the objects alone.
+state, motion, gains) is in the objects alone. Renewals of the lease, the most frequent messages to a module,
+need no more of them than `attend`.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from module_agent.firmware import tick_kernel as kernel
-from module_agent.firmware.firmware import Firmware, Outgoing
+from module_agent.firmware.firmware import Firmware, Incoming, Outgoing
 from module_agent.firmware.run_kernel import settle_rows
 from module_agent.firmware.tick_kernel import NOT_QUIET, QUIET, ROW_DUE, Floats
 from module_agent.hardware.hardware import Readings
@@ -135,6 +137,15 @@ class QuietTicks:
         assert module is not None
         out = module.firmware.keep_rows(self._held_rows[place, :count].reshape(-1).data)
         self._held[place], self._room[place] = 0, min(module.firmware.rows_to_batch, _HELD_ROWS)
+        return out
+
+    def attend(self, place: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
+        """Give a module the renewals of its lease that came for a quiet tick; return the answers."""
+        module = self._objects[place]
+        assert module is not None
+        out = module.firmware.attend(self.now_ns[place], renewals)
+        fresh_ns, lease_until_ns = module.firmware.valid_ns
+        self._modules["fresh_ns"][place], self._modules["lease_until_ns"][place] = fresh_ns, lease_until_ns
         return out
 
     def keep_held(self, places: range) -> None:
