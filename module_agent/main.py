@@ -1,6 +1,5 @@
 """`x5-agent`: the process that runs one or several modules on a physics bus and the network."""
 
-import gc
 import os
 import secrets
 import signal
@@ -25,6 +24,7 @@ from module_agent.hardware.hebi_network import FAMILY, RATE_HZ, HebiOptions, ope
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import EXIT_FAILED, EXIT_LOST, EXIT_USAGE, RobotError, UsageError
+from module_agent.model.garbage import leave_out_imports
 from module_agent.model.settings import read_settings, variable
 from module_agent.model.version import installed_version
 from module_agent.network_emulation.impaired_transport import inject
@@ -284,11 +284,11 @@ def _run(
                 opened.callback(modules.close)
                 transport = open_transport([module.serial for module in modules.information])
                 opened.callback(transport.close)
-                _settle()
+                leave_out_imports()
             else:
                 transport = open_transport(list(source.serials))
                 opened.callback(transport.close)
-                _settle()
+                leave_out_imports()
                 # The world waits for every agent on its bus, so the bus comes last.
                 modules = LoopInside(BusClient(source.path, source.serials), source.limits)
                 opened.callback(modules.close)
@@ -298,13 +298,6 @@ def _run(
                 host = AgentHost(robot, modules, transport, configs, worker)
         opened.pop_all()
     _serve(host, worker)
-
-
-def _settle() -> None:
-    # A full collection of what the imports have left takes 38 ms, in which no tick would run: it is made
-    # once, and they are not looked at again.
-    gc.collect()
-    gc.freeze()
 
 
 def _check_expiry(expiry: str, hebi: bool) -> None:

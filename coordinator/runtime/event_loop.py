@@ -9,6 +9,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 from module_agent.model.errors import UsageError
+from module_agent.model.garbage import leave_out_imports
 
 
 def check_speed(speed: float) -> float:
@@ -105,6 +106,7 @@ def attend(
     loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, T], ends: Callable[[], bool] = lambda: False
 ) -> T:
     """Run work to its end, and close the loop; a signal cancels the work, unless `ends` ends it in order."""
+    leave_out_imports()
     task = loop.create_task(work)
     interruption = Interruption(loop, task)
 

@@ -1,6 +1,5 @@
 """`x5-sim world`: the world of one robot, which agents attach to."""
 
-import gc
 import signal
 from contextlib import suppress
 from pathlib import Path
@@ -11,6 +10,7 @@ import typer
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.event_loop import SIGNALS
 from module_agent.model.errors import UsageError
+from module_agent.model.garbage import leave_out_imports
 from sim.commands.options import WorldOptions, load
 from sim.world.bus_server import BusServer
 from sim.world.truth import EVERY_TICKS, TruthLog, write_truth
@@ -49,9 +49,7 @@ def world(
     except OSError as error:
         raise UsageError(str(error)) from error
     _say(f"{robot.name}: {len(plant.modules)} modules on {bus}")
-    # A full collection of what the imports have left would stop all modules' ticks.
-    gc.collect()
-    gc.freeze()
+    leave_out_imports()
     with server:
         report = server.run(settings.speed, lambda: bool(stopping))
     _say(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time")
