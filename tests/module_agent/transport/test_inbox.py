@@ -30,13 +30,14 @@ def test_of_every_key_the_oldest_come_out_once_in_order_and_the_rest_is_counted(
         if isinstance(step, int):
             got = inbox.drain(limit=step)
             assert got == sorted(got, key=lambda event: event.payload)
-            lanes = sum(map(bool, waiting.values()))
+            lanes, there = sum(map(bool, waiting.values())), sum(map(len, waiting.values()))
             assert min(step, lanes) <= len(got) <= step
             for key, events in waiting.items():
                 own = [event for event in got if event.key == key]
-                # All keys have the same share, unless there are more keys than may be taken.
+                # All keys have the same share, unless all events or less than one of each may be taken.
                 assert own == events[: len(own)]
-                assert step < lanes or len(own) == min(len(events), step // max(1, lanes))
+                share = len(events) if there <= step else step // max(1, lanes)
+                assert step < lanes or len(own) == min(len(events), share)
                 del events[: len(own)]
             taken += len(got)
         else:
@@ -49,6 +50,14 @@ def test_of_every_key_the_oldest_come_out_once_in_order_and_the_rest_is_counted(
         assert inbox.waiting == any(waiting.values())
         assert inbox.dropped == dropped
     assert offered == taken + dropped + len(inbox)
+
+
+def test_few_events_are_taken_all_at_once_however_they_are_shared_among_keys() -> None:
+    inbox = Inbox(100)
+    for number, name in enumerate("aaab"):
+        inbox.put(_event(number, name), stamp=number)
+    assert [stamp for stamp, _ in inbox.drain_stamped(limit=4)] == [0, 1, 2, 3]
+    assert (len(inbox), inbox.lanes, inbox.waiting) == (0, 0, False)
 
 
 def test_threads_that_put_at_once_lose_nothing_uncounted() -> None:
