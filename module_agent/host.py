@@ -119,10 +119,10 @@ class HostedModule:
         if self.stops.waiting or self.inbox.waiting:
             self._arrived = self.stops.drain(limit=len(self.stops)) + self.inbox.drain()
             self.firmware.dropped_events = self.inbox.dropped + self.stops.dropped
-            self.renewals = self._read_renewals()
+            self.renewals = self._only_renewals()
         return bool(self._arrived)
 
-    def _read_renewals(self) -> list[Incoming]:
+    def _only_renewals(self) -> list[Incoming]:
         read: list[tuple[Request | Sample, Message]] = []
         for event in self._arrived if len(self._arrived) <= MAX_RENEWALS else ():
             if not isinstance(event, Request | Sample) or self._leaves[event.key] is not Leaf.LEASE:
@@ -147,10 +147,10 @@ class HostedModule:
         self._arrived = []
         return self.firmware.step(sample, incoming)
 
-    def attend(self, quiet: QuietTicks, place: int) -> list[Outgoing]:
+    def read_renewals(self, quiet: QuietTicks, place: int) -> list[Outgoing]:
         """Read the renewals that were collected before a tick that was quiet; return what to send."""
         renewals, self.renewals, self._arrived = self.renewals, [], []
-        return quiet.attend(place, renewals)
+        return quiet.read_renewals(place, renewals)
 
     def publish(self, pwm: float) -> list[Outgoing]:
         """End a tick with the module's PWM; return what to send."""
@@ -317,7 +317,7 @@ class AgentHost:
     def _cycle_on_bus(self, bus: BusRun, busy: list[int]) -> None:
         assert self._quiet is not None
         if self._renews:
-            # The tick is answered before they are read.
+            # A tick that is quiet for all modules is answered before they are read.
             self.bell[0] = 1
         results = bus.run(busy, 1 if busy or self.has_work else MANY_TICKS)
         self.finish(bus.readings, results)
@@ -358,7 +358,7 @@ class AgentHost:
                 out = module.publish(self._loops.run(index, command))
                 quiet.store(place)
             else:
-                out = module.attend(quiet, place) if module.renewals else []
+                out = module.read_renewals(quiet, place) if module.renewals else []
                 if results[place] == ROW_DUE:
                     out += quiet.keep_rows(place)
             for outgoing in out:

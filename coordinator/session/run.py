@@ -211,9 +211,14 @@ class Run:
         self._identified: Identified | None = None
         if crashed is not None:
             self._take_over(crashed)
-        # Virtual time has no cost of its own that would be one of the machine's.
-        real = (None, None) if config.inline else (time.thread_time_ns, COALESCED_S)
-        self._messenger = Messenger(transport, config.robot, clock, post, self._record, *real)
+        # Virtual time has no cost of its own that would be one of the machine's, and nothing there has to be
+        # woken.
+        cpu_clock, coalesced_s = (None, None) if config.inline else (time.thread_time_ns, COALESCED_S)
+        self._messenger = Messenger(
+            *(transport, config.robot, clock, post, self._record),
+            cpu_clock=cpu_clock,
+            coalesced_s=coalesced_s,
+        )
         gate = config.gate.admit if config.gate is not None else None
         self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender, gate)
         self._requests = InformationRequests(

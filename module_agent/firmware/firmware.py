@@ -253,7 +253,7 @@ class Firmware:
         self._command = Command(position_rad, velocity_rad_s, effort_nm)
         self._rows.go_on(due_ns, imu_ns)
 
-    def attend(self, now_ns: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
+    def read_renewals(self, now_ns: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
         """Read renewals of the lease after a tick that was quiet without them; return the answers.
 
         A tick reads them after it has looked for what is over, and they change nothing that it does then.
@@ -265,8 +265,8 @@ class Firmware:
         return out
 
     @property
-    def valid_ns(self) -> tuple[int, int]:
-        """From when on the last command counts as fresh, and until when the lease is held."""
+    def validity_ns(self) -> tuple[int, int]:
+        """From which time of its feedback on the lifetime of commands counts, and when the lease lapses."""
         return self._fresh_ns, self.lease.until_ns
 
     @property

@@ -4,7 +4,7 @@ Most ticks are quiet: nothing has arrived, no time is up, no state changes. Then
 `tick_kernel.tick`; each of the others is run by its Python objects, which are the definition: `load` gives
 them what quiet ticks have changed, `store` takes what the kernel needs. What only Python changes (lease,
 state, motion, gains) is in the objects alone. Renewals of the lease, the most frequent messages to a module,
-need no more of them than `attend`.
+need no more of them than `read_renewals`.
 """
 
 from collections.abc import Sequence
@@ -139,12 +139,12 @@ class QuietTicks:
         self._held[place], self._room[place] = 0, min(module.firmware.rows_to_batch, _HELD_ROWS)
         return out
 
-    def attend(self, place: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
+    def read_renewals(self, place: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
         """Give a module the renewals of its lease that came for a quiet tick; return the answers."""
         module = self._objects[place]
         assert module is not None
-        out = module.firmware.attend(self.now_ns[place], renewals)
-        fresh_ns, lease_until_ns = module.firmware.valid_ns
+        out = module.firmware.read_renewals(self.now_ns[place], renewals)
+        fresh_ns, lease_until_ns = module.firmware.validity_ns
         self._modules["fresh_ns"][place], self._modules["lease_until_ns"][place] = fresh_ns, lease_until_ns
         return out
 

@@ -319,21 +319,69 @@ def test_an_answer_does_not_wait_with_publications(
     assert len(recorded) == 32
 
 
-def test_what_cannot_be_recorded_leaves_the_publications_behind_it_to_the_next_look(bench: Bench) -> None:
+def test_what_cannot_be_recorded_does_not_hold_up_the_publications_behind_it(bench: Bench) -> None:
+    recorded_ns = list[int]()
+
     def record(entry: Entry) -> Message | None:
         if entry.t_ns == 600_000:
             raise _Unrecordable(entry.topic)
+        recorded_ns.append(bench.loop.now_ns)
         return bench._record(entry)
 
     endpoint, clock = bench.network.endpoint("patient"), lambda: bench.loop.now_ns
     post = bench.loop.call_soon
     messenger = Messenger(endpoint, bench.wire.robot, clock, post, record, coalesced_s=2e-3)
     messenger.start()
-    _publish_every_us(bench, 300, 20)
+    _publish_every_us(bench, 300, 7)
     with pytest.raises(_Unrecordable):
         bench.run(asyncio.sleep(0.1))
     bench.run(asyncio.sleep(0.1))
-    assert [entry.t_ns for entry in bench.entries] == [300_000 * n for n in range(20) if n != 2]
+    assert [entry.t_ns for entry in bench.entries] == [300_000 * n for n in range(7) if n != 2]
+    # The first woke the loop; all others were seen when it looked.
+    assert recorded_ns == [0, *[2_000_000] * 5]
+
+
+def test_what_one_drain_leaves_does_not_wait_for_the_next_look(
+    coalescing: tuple[Bench, Messenger, list[tuple[int, Entry]]],
+) -> None:
+    bench, messenger, recorded = coalescing
+    wire, answered_ns = bench.wire, list[int]()
+    bench.serve(Leaf.STATUS, lambda request: encode(wire.status()))
+
+    async def ask() -> None:
+        # The loop looks already, and 500 messages on 100 keys come at once, before an answer.
+        bench.module.publish(key(wire.robot, "A", Leaf.STATUS), encode(wire.status()))
+        await asyncio.sleep(1e-3)
+        for number in range(500):
+            serial = f"M{number % 100}"
+            bench.module.publish(key(wire.robot, serial, Leaf.STATUS), encode(wire.status(serial)))
+        await messenger.ask("A", Leaf.STATUS, wire.ask("A"))
+        answered_ns.append(bench.loop.now_ns)
+        await asyncio.sleep(0.1)
+
+    bench.run(ask())
+    assert answered_ns == [1_000_000]
+    assert {at_ns for at_ns, entry in recorded if entry.kind == "publication"} == {0, 1_000_000}
+    assert len(recorded) == 503
+
+
+def test_that_a_module_leaves_does_not_wait_with_publications(
+    coalescing: tuple[Bench, Messenger, list[tuple[int, Entry]]],
+) -> None:
+    bench, messenger, _ = coalescing
+    token = bench.module.declare_alive(key(bench.wire.robot, "A", Leaf.ALIVE))
+    bench.run(asyncio.sleep(0.01))
+    _publish_every_us(bench, 300, 30)
+
+    async def leave() -> None:
+        await asyncio.sleep(3.4e-3)
+        assert messenger.alive == {"A"}
+        token.undeclare()
+        await asyncio.sleep(0.0)
+        await asyncio.sleep(1e-6)
+        assert not messenger.alive
+
+    bench.run(leave())
 
 
 class _Unrecordable(Exception):

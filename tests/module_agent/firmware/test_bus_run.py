@@ -10,6 +10,8 @@ import pytest
 from module_agent.control.safety import UNCONFIGURED, Safety
 from module_agent.firmware import bus_run
 from module_agent.firmware.bus_run import BusRun
+from module_agent.firmware.firmware import Incoming, Outgoing
+from module_agent.firmware.quiet_ticks import QuietTicks
 from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.bus_frames import MAX_HANDSHAKE_BYTES, TickFrames, Welcome, pack_welcome
 from module_agent.hardware.hardware import HardwareLost, Readings, SensorSample
@@ -158,5 +160,30 @@ def test_what_arrives_ends_a_run_of_ticks_at_once(tmp_path: Path) -> None:
     agent.host.bell[0] = 0
     agent.host._bus_run.run([], 32)
     assert bus.tick - agent.tick_now < behind - 2
+    bus.close()
+    agent.host.close()
+
+
+def test_a_tick_is_answered_before_the_renewals_that_came_for_it_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = Bus(path := str(tmp_path / "bus"))
+    agent = OnBus(bus, path, "hold", (UNCONFIGURED,) * 3)
+    life = Life([agent], 3)
+    life.ticks(3)
+    life.act(("acquire", 0))
+    life.ticks(3)
+    agent.catch_up()
+    unanswered, read_renewals = list[int](), QuietTicks.read_renewals
+
+    def noted(self: QuietTicks, place: int, renewals: Sequence[Incoming]) -> list[Outgoing]:
+        bus.read()
+        unanswered.append(agent.tick_now + 1 - len(bus.answers))
+        return read_renewals(self, place, renewals)
+
+    monkeypatch.setattr(QuietTicks, "read_renewals", noted)
+    life.act(("renew", 0))
+    agent.catch_up()
+    assert unanswered == [0]
     bus.close()
     agent.host.close()

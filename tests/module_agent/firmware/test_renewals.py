@@ -12,7 +12,7 @@ from module_agent.host import MAX_RENEWALS
 from module_agent.transport.transport import Request, Sample
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
-from module_agent.wire.messages import Ack, Ask, LeaseRequest, Stop
+from module_agent.wire.messages import Ack, Ask, LeaseRequest, MotionCommand, Rest, Setpoint, Stop
 from module_agent.wire.proof import proven
 from tests.module_agent.firmware.test_quiet_ticks import (
     BOOT,
@@ -25,7 +25,7 @@ from tests.module_agent.firmware.test_quiet_ticks import (
 )
 
 SECRET = b"0123456789abcdef"
-HEALTHY: dict[str, Any] = {"asks": True}
+ACCEPTED: dict[str, Any] = {"asks": True}
 # What is wrong with a renewal, and whether it asks for an answer.
 RENEWALS = st.fixed_dictionaries(
     {"asks": st.booleans()},
@@ -42,11 +42,17 @@ RENEWALS = st.fixed_dictionaries(
         "leaf": st.just(Leaf.GAINS),
     },
 )
+# What else happens to module 1 in the same tick.
+BESIDES = st.sampled_from(
+    ["", "", "", "ask", "stop", "hot", "sick", "forwards", "back", "stands", "move", "aim"]
+)
+# After how many ticks more the next renewals come: also just when leases of 20 and 90 ms lapse, commands of
+# 40 ms expire and motions of 20 and 50 ms end.
 EVENTS = st.lists(
     st.tuples(
-        st.integers(0, 40),
+        st.one_of(st.integers(0, 40), st.sampled_from([18, 19, 20, 38, 39, 40, 48, 49, 88, 89])),
         st.lists(st.tuples(st.integers(0, 2), RENEWALS), max_size=MAX_RENEWALS + 2),
-        st.sampled_from(["", "", "", "ask", "stop"]),
+        BESIDES,
     ),
     max_size=12,
 )
@@ -55,8 +61,8 @@ EVENTS = st.lists(
 class Holder:
     """Who holds the leases of all modules of some agents, and tells all agents the same."""
 
-    def __init__(self, agents: Sequence[Agent], seed: int):
-        self._agents, self.life = agents, Life(agents, seed)
+    def __init__(self, agents: Sequence[Agent], seed: int, jitter_ns: int = 20):
+        self._agents, self.life = agents, Life(agents, seed, jitter_ns)
         self._seq = 0
 
     def acquire(self) -> None:
@@ -90,44 +96,73 @@ class Holder:
             answer: Any = lambda answer, sent=sent: sent.append((at + " answer", answer))  # noqa: E731
             agent.network.sinks[at](Request(at, payload, answer) if asks else Sample(at, payload))
 
-    def tell(self, what: str) -> None:
+    def happen(self, what: str) -> None:
+        """Let something happen to module 1 in the next tick."""
         self._seq += 1
         head: dict[str, Any] = {"serial": "B", "boot": BOOT, "seq": self._seq, "sender": "me"}
-        if what == "ask":
-            self._tell(1, Leaf.STATUS, encode(Ask(**head)), True)
-        elif what == "stop":
-            self._tell(1, Leaf.STOP, encode(Stop(**head, why="test")), True)
+        command = {**head, "token": 1, "echo_ns": max(0, self.life._now[1] - MS)}
+        match what:
+            case "ask":
+                self._tell(1, Leaf.STATUS, encode(Ask(**head)), True)
+            case "stop":
+                self._tell(1, Leaf.STOP, encode(Stop(**head, why="test")), True)
+            case "move":
+                motion = MotionCommand(**command, motion_id=self._seq, pattern=Rest(duration_s=0.02))
+                self._tell(1, Leaf.MOTION, proven(encode(motion), SECRET), True)
+            case "aim":
+                aim = Setpoint(**command, position_rad=0.1, velocity_rad_s=None, effort_nm=None)
+                self._tell(1, Leaf.SETPOINT, proven(encode(aim), SECRET), False)
+            case "hot":
+                self.life._winding[1] = 160.0
+            case "sick":
+                self.life._sick[1] = "effort_nm", float("nan"), 2
+            case "forwards":
+                self.life._now[1] += 130 * MS
+            case "back":
+                self.life._now[1] -= 700 * MS
+            case "stands":
+                self.life._rate[1] = 1.0 - self.life._rate[1]
 
 
 @pytest.fixture
 def attended(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     """The places whose renewals left their ticks quiet."""
-    places, attend = list[int](), QuietTicks.attend
+    places, read_renewals = list[int](), QuietTicks.read_renewals
 
     def counted(self: QuietTicks, place: int, renewals: Any) -> Any:
         places.append(place)
-        return attend(self, place, renewals)
+        return read_renewals(self, place, renewals)
 
-    monkeypatch.setattr(QuietTicks, "attend", counted)
+    monkeypatch.setattr(QuietTicks, "read_renewals", counted)
     return places
 
 
-def both(rate_hz: float = 250.0) -> list[Agent]:
-    return [Agent(is_compiled, 3, "hold", rate_hz) for is_compiled in (False, True)]
+def both(rate_hz: float = 250.0, expiry: str = "hold") -> list[Agent]:
+    return [Agent(is_compiled, 3, expiry, rate_hz) for is_compiled in (False, True)]
 
 
-@settings(deadline=None, max_examples=60)
-@given(st.integers(0, 2**32 - 1), EVENTS, st.sampled_from([250.0, 1000.0]))
+@settings(deadline=None, max_examples=80)
+@given(
+    st.integers(0, 2**32 - 1),
+    EVENTS,
+    st.sampled_from([250.0, 1000.0]),
+    st.sampled_from(["hold", "damping", "motor_off"]),
+    st.sampled_from([0, 20]),
+)
 def test_renewals_of_every_kind_do_the_same_in_both(
-    seed: int, events: list[tuple[int, list[tuple[int, dict[str, Any]]], str]], rate_hz: float
+    seed: int,
+    events: list[tuple[int, list[tuple[int, dict[str, Any]]], str]],
+    rate_hz: float,
+    expiry: str,
+    jitter_ns: int,
 ) -> None:
-    agents = both(rate_hz)
-    holder = Holder(agents, seed)
+    agents = both(rate_hz, expiry)
+    holder = Holder(agents, seed, jitter_ns)
     holder.acquire()
     for ticks, renewals, besides in events:
         for k, how in renewals:
             holder.renew(k, how)
-        holder.tell(besides)
+        holder.happen(besides)
         holder.life.ticks(1 + ticks)
     assert not first_difference(agents)
     refusals = [[module.firmware.admission.refusals for module in agent.host.modules] for agent in agents]
@@ -171,7 +206,7 @@ def test_a_renewal_leaves_the_rows_of_its_process_waiting(attended: list[int]) -
         patch.setattr(QuietTicks, "keep_rows", counted)
         for _ in range(20):
             for k in range(3):
-                holder.renew(k, HEALTHY)
+                holder.renew(k, ACCEPTED)
             holder.life.ticks(5)
     assert len(attended) == 60
     # Whole batches alone: of the first, the objects have kept a row.
@@ -187,7 +222,7 @@ def test_more_renewals_than_a_holder_sends_are_read_by_the_objects(attended: lis
     for count, places in ((MAX_RENEWALS, [2]), (MAX_RENEWALS + 1, [])):
         attended.clear()
         for _ in range(count):
-            holder.renew(2, HEALTHY)
+            holder.renew(2, ACCEPTED)
         holder.life.ticks(1)
         assert attended == places
     assert not first_difference(agents)
@@ -200,18 +235,18 @@ def test_nothing_but_renewals_leaves_a_tick_quiet(attended: list[int]) -> None:
     for what in ("ask", "stop"):
         holder.life.ticks(7)
         attended.clear()
-        holder.renew(1, HEALTHY)
-        holder.tell(what)
+        holder.renew(1, ACCEPTED)
+        holder.happen(what)
         holder.life.ticks(1)
         assert attended == []
     # A renewal on a key that is not the lease's is none.
     attended.clear()
-    holder.renew(2, HEALTHY | {"leaf": Leaf.GAINS})
+    holder.renew(2, ACCEPTED | {"leaf": Leaf.GAINS})
     holder.life.ticks(1)
     assert attended == []
     # Of a module that is stopped leases are renewed, too.
     assert agents[1].host.modules[1].firmware.state == "stopped"
-    holder.renew(1, HEALTHY)
+    holder.renew(1, ACCEPTED)
     holder.life.ticks(1)
     assert attended == [1]
     assert not first_difference(agents)

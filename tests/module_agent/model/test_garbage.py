@@ -4,19 +4,24 @@ import subprocess
 import sys
 
 PROGRAM = """
-import gc
+import gc, weakref
 from module_agent.model.garbage import leave_out_imports
 import numpy
-ring = []
-ring.append(ring)
-del ring
+class Ring:
+    def __init__(self):
+        self.own = self
+gc.disable()
+dead = weakref.ref(Ring())
 leave_out_imports()
 assert gc.get_freeze_count() > 10_000
-assert not gc.collect(), "a ring of before is kept"
+assert dead() is None, "garbage of before is kept"
 kept = gc.get_freeze_count()
 later = [[] for _ in range(1000)]
 leave_out_imports()
 assert gc.get_freeze_count() <= kept, "what came later is kept"
+dead = weakref.ref(Ring())
+gc.collect()
+assert dead() is None, "later garbage is kept"
 """
 
 
