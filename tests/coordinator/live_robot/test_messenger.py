@@ -1,18 +1,20 @@
 """Questions, answers, refusals and silence in virtual time; everything that passes is recorded."""
 
 import asyncio
+import time
 from collections.abc import Callable, Coroutine, Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from coordinator.live_robot.messenger import LANE_BYTES, Messenger, NoAnswer, Refused
 from coordinator.recording.recording import MAX_MODULES, Entry, Recording
 from module_agent.transport.inbox import EVENT_BYTES
-from module_agent.transport.transport import Request, TransportError
+from module_agent.transport.transport import Request, Sample, TransportError
 from module_agent.wire.codec import decode, encode
-from module_agent.wire.keys import Leaf, key
+from module_agent.wire.keys import Leaf, every, key
 from module_agent.wire.messages import Ack, Identify, LeaseRequest, Message, Stop
 from module_agent.wire.refusal import WireError
 from sim.virtual_time.loop import VirtualLoop
@@ -423,6 +425,53 @@ def test_what_cannot_be_recorded_does_not_leave_what_came_with_it_unread(wire: S
         posted.pop(0)()
     assert sorted(bench.recording.modules) == sorted(f"M{number}" for number in range(20) if number != 3)
     bench.loop.close()
+
+
+class _OfSinks:
+    """A transport of which only the sinks are there, for threads to call."""
+
+    def __init__(self) -> None:
+        self.sinks: dict[str, Any] = {}
+
+    def subscribe(self, at: str, sink: Any) -> Any:
+        self.sinks[at] = sink
+        return SimpleNamespace(undeclare=lambda: None)
+
+    watch_alive = subscribe
+
+    def close(self) -> None:
+        pass
+
+
+def test_no_publication_is_left_behind_whenever_a_thread_publishes_it(wire: SimpleNamespace) -> None:
+    """With a real loop and a real thread: pairs, the second about when the loop looks for the last time."""
+    transport, numbers, pairs = _OfSinks(), set[int](), 300
+    pauses_s = np.random.default_rng(1).uniform(1e-3, 4e-3, pairs).tolist()
+
+    def record(entry: Entry) -> Message | None:
+        numbers.add(int(entry.payload))
+        return None
+
+    def publish(pair: int) -> None:
+        topic = key(wire.robot, "A", Leaf.STATUS)
+        for number in (2 * pair, 2 * pair + 1):
+            transport.sinks[every(wire.robot, Leaf.STATUS)](Sample(topic, b"%d" % number))
+            time.sleep(pauses_s[pair])
+
+    async def listen() -> None:
+        post = asyncio.get_running_loop().call_soon_threadsafe
+        messenger = Messenger(transport, wire.robot, lambda: 0, post, record, coalesced_s=2e-3)
+        messenger.start()
+        for pair in range(pairs):
+            await asyncio.to_thread(publish, pair)
+            # Nothing comes now that would wake the loop for what was left.
+            async with asyncio.timeout(10.0):
+                while 2 * pair + 1 not in numbers:
+                    await asyncio.sleep(1e-3)
+        messenger.close()
+
+    asyncio.run(listen())
+    assert numbers == set(range(2 * pairs))
 
 
 def test_sequence_numbers_increase(bench: Bench) -> None:
