@@ -5,9 +5,9 @@ Clock and event loop are arguments, so that the same code runs in real and in vi
 Where a thread of the transport receives, each message that wakes the event loop costs more than what is done
 with it. So while publications come they are looked for every `COALESCED_S`, and only the first after a pause
 wakes the loop; answers and liveliness always do. Loops that control by what they hear do without. Measured
-with 3,200 messages a second on two cores that were not free: 148 us of processor time a message instead of
-217, and 99 % of delays from the sample to the coordinator's thread within 4.3 ms instead of 9.7, as the two
-threads wait less for the interpreter.
+with 3,200 messages a second on two busy cores, with and without in turn, medians of three: 176 us of
+processor time a message instead of 216, and 99 % of delays from the sample to the coordinator's thread within
+4.4 ms instead of 8.1, as the two threads wait less for the interpreter.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ Post = Callable[[Callable[[], None]], object]
 # Of one module's key, and of all: 40 s of feedback, and 30 s of that of 64 modules.
 LANE_BYTES, INBOX_BYTES = 1 << 21, 1 << 26
 STOP_ATTEMPTS, STOP_ANSWER_S = 3, 0.3
-# Less than a row's period at 250 Hz. The system rounds it up to a millisecond of real time.
+# Less than a row's period at 250 Hz. The system waits for whole milliseconds of real time, at least one.
 COALESCED_S = 0.002
 Record = Callable[[Entry], Message | None]
 
